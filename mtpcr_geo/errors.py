@@ -1,0 +1,68 @@
+"""Everything a user can cause, as one family of exceptions with documented exit codes.
+
+A message says what is wrong, where, and what to do about it. The command prints it in one line and
+exits with the class's code:
+
+====  ==============================================================
+code  meaning
+====  ==============================================================
+0     done; for ``register``: accepted
+1     a fault in the program itself (please report it)
+2     the command line, a pipeline or an option is wrong
+3     registered, but the verdict is *doubtful*
+4     the verdict is *refused*; evidence is written, no registered cloud
+5     an input cannot be read or holds nothing usable
+6     the coordinate reference systems do not allow it
+7     an output cannot be written
+8     an optional part (PDAL, a model file) is missing
+130   interrupted
+====  ==============================================================
+"""
+
+EXIT_DOUBTFUL = 3
+EXIT_REFUSED = 4
+
+
+class MtpcrError(Exception):
+    """Base of every error a user can cause."""
+
+    exit_code = 1
+
+
+class OptionError(MtpcrError):
+    """An option, a pipeline or the command line is wrong."""
+
+    exit_code = 2
+
+
+class InputError(MtpcrError):
+    """An input file cannot be read, or holds nothing that can be used."""
+
+    exit_code = 5
+
+
+class CrsError(MtpcrError):
+    """A coordinate reference system is missing, not handled, or does not match the other one."""
+
+    exit_code = 6
+
+
+class OutputError(MtpcrError):
+    """An output cannot be written, or exists already."""
+
+    exit_code = 7
+
+
+class MissingPartError(MtpcrError):
+    """An optional part (PDAL, a model file) is needed and not there."""
+
+    exit_code = 8
+
+
+class RegistrationError(MtpcrError):
+    """The clouds were read, but a step of the method has nothing to work with.
+
+    The run is refused: exit code 4, evidence is kept, no registered cloud is written.
+    """
+
+    exit_code = EXIT_REFUSED

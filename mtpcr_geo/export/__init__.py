@@ -1,0 +1,1 @@
+"""What a run leaves behind: rasters, transform files, ties, report."""

@@ -1,0 +1,80 @@
+"""Rigid transforms as 4x4 float64 matrices, acting on row-wise (n, 3) arrays of metres.
+
+A variable ``T_to_from`` takes coordinates of frame ``from`` to frame ``to``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Matrix = NDArray[np.float64]
+Points = NDArray[np.float64]
+
+
+def apply(T_to_from: Matrix, xyz: Points) -> Points:
+    """Move points: (n, 3) coordinates in ``from`` become (n, 3) coordinates in ``to``."""
+    return np.asarray(xyz, np.float64) @ T_to_from[:3, :3].T + T_to_from[:3, 3]
+
+
+def compose(R: Matrix, t: Points) -> Matrix:
+    """Build a 4x4 transform from a (3, 3) rotation and a (3,) translation."""
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = t
+    return T
+
+
+def translation(t: Points | tuple[float, float, float]) -> Matrix:
+    """Build the 4x4 transform that adds ``t`` (3,)."""
+    return compose(np.eye(3), np.asarray(t, np.float64))
+
+
+def inverse(T: Matrix) -> Matrix:
+    """Invert a rigid transform exactly: the rotation is transposed, nothing is solved for."""
+    R = T[:3, :3]
+    return compose(R.T, -R.T @ T[:3, 3])
+
+
+def yaw_matrix(yaw: float) -> Matrix:
+    """Rotate about the vertical by ``yaw`` radians, counter-clockwise seen from above: (3, 3)."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def tilt_matrix(axis_azimuth: float, tilt: float) -> Matrix:
+    """Rotate by ``tilt`` radians about a horizontal axis at ``axis_azimuth`` radians from x: (3, 3)."""
+    return axis_angle_matrix(np.array([np.cos(axis_azimuth), np.sin(axis_azimuth), 0.0]), tilt)
+
+
+def axis_angle_matrix(axis: Points, angle: float) -> Matrix:
+    """Rotate by ``angle`` radians about a unit ``axis`` (3,), by Rodrigues' formula: (3, 3)."""
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K)
+
+
+def about(pivot: Points, R: Matrix) -> Matrix:
+    """Rotate by ``R`` (3, 3) about ``pivot`` (3,): the pivot stays where it is."""
+    return compose(R, pivot - R @ pivot)
+
+
+def rotation_angle(R: Matrix) -> float:
+    """Angle of a (3, 3) rotation in radians, accurate for tiny angles too.
+
+    Equals ``arccos((trace - 1) / 2)``, which loses half its digits near zero; the skew part does not.
+    """
+    skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return float(np.arctan2(np.linalg.norm(skew), np.trace(R) - 1.0))
+
+
+def yaw_of(R: Matrix) -> float:
+    """Yaw of a (3, 3) rotation in radians: the turn about the vertical of its x axis."""
+    return float(np.arctan2(R[1, 0], R[0, 0]))
+
+
+def orthonormal(R: Matrix) -> Matrix:
+    """Nearest proper rotation to a (3, 3) matrix, in the Frobenius sense."""
+    U, _, Vt = np.linalg.svd(R)
+    D = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    return np.asarray(U @ D @ Vt)

@@ -1,0 +1,1 @@
+"""Matchers: from two BEVs to point pairs in them."""

@@ -1,0 +1,48 @@
+"""Where a raster lies: the mapping between metres and pixels, with pixel centres throughout."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A north-up raster of square cells.
+
+    Pixel coordinates are (column, row) as float64 with (0, 0) the *centre* of the top-left cell, so a
+    point at pixel (c, r) lies at x = west + (c + 0.5) * cell and y = north - (r + 0.5) * cell.
+
+    Attributes:
+        west, north: outer top-left corner of the raster in metres (levelled work frame).
+        cell: edge of a cell in metres.
+        width, height: number of columns and rows.
+
+    """
+
+    west: float
+    north: float
+    cell: float
+    width: int
+    height: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape of an image on this grid: (height, width)."""
+        return self.height, self.width
+
+    def to_pixel(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Take (n, 2) metres to (n, 2) pixel coordinates (column, row)."""
+        xy = np.asarray(xy, np.float64)
+        return np.stack(
+            [(xy[:, 0] - self.west) / self.cell - 0.5, (self.north - xy[:, 1]) / self.cell - 0.5], axis=1
+        )
+
+    def to_metres(self, pixel: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Take (n, 2) pixel coordinates (column, row) to (n, 2) metres: Eq. 5 with pixel centres."""
+        pixel = np.asarray(pixel, np.float64)
+        return np.stack(
+            [self.west + (pixel[:, 0] + 0.5) * self.cell, self.north - (pixel[:, 1] + 0.5) * self.cell], axis=1
+        )
