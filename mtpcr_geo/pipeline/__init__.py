@@ -1,0 +1,1 @@
+"""The one engine: stages named by JSON, wired and run."""

@@ -1,0 +1,103 @@
+"""What a stage is: options, inputs, one thing made."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Protocol
+
+from pydantic import BaseModel, ConfigDict
+
+from mtpcr_geo.audit import NullRecorder, Recorder
+from mtpcr_geo.cloud.base import Cloud
+from mtpcr_geo.errors import OptionError
+from mtpcr_geo.export.files import OutputSet
+from mtpcr_geo.scene import Pair
+
+Value = Cloud | Pair
+
+
+class StageOptions(BaseModel):
+    """Base of every stage's options: a misspelt key is an error, and nothing changes after reading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Progress(Protocol):
+    """Where long work says how far it is."""
+
+    def task(self, what: str, total: int | None = None) -> AbstractContextManager[Any]:
+        """Open a task; the context gives a callable `advance(n)`."""
+
+
+@dataclass
+class RunContext:
+    """What every stage of one run shares.
+
+    Attributes:
+        outputs: where files are written until the run is whole.
+        progress: where long work reports.
+        recorder: the audit; a no-op twin when nobody wants a recording.
+        seed: of everything random.
+        force: write the registered cloud though the verdict refuses it.
+        done: one entry a finished stage (type, tag, options, seconds, metadata), in order.
+
+    """
+
+    outputs: OutputSet
+    progress: Progress
+    recorder: Recorder = field(default_factory=NullRecorder)
+    seed: int = 0
+    force: bool = False
+    done: list[dict[str, Any]] = field(default_factory=list)
+
+
+class Stage(ABC):
+    """One step of a pipeline.
+
+    Class attributes:
+        type: its name in the JSON, such as "mtpcr.level" or "readers.las".
+        Options: the pydantic model of its options.
+
+    """
+
+    type: ClassVar[str]
+    Options: ClassVar[type[StageOptions]]
+
+    def __init__(self, options: StageOptions, tag: str) -> None:
+        self.options = options
+        self.tag = tag
+        self.metadata: dict[str, Any] = {}
+
+    def check(self, context: RunContext) -> None:  # noqa: B027 - most stages have nothing to check
+        """Find out before the run what would stop this stage: files, folders, optional parts.
+
+        Raises:
+            MtpcrError: saying what is wrong and what to do.
+
+        """
+
+    @abstractmethod
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Do the work. Writers hand on what they were given; None means nothing goes on from here."""
+
+    def one_pair(self, inputs: Sequence[Value]) -> Pair:
+        """Take the single registration state among the inputs.
+
+        Raises:
+            OptionError: if the inputs are something else.
+
+        """
+        if len(inputs) == 1 and isinstance(inputs[0], Pair):
+            return inputs[0]
+        raise OptionError(
+            f"stage {self.tag} ({self.type}) needs a pair of clouds from mtpcr.level or a later mtpcr stage, "
+            f"and got {_describe(inputs)}; set its inputs"
+        )
+
+
+def _describe(inputs: Sequence[Value]) -> str:
+    kinds = ["a pair" if isinstance(value, Pair) else "a cloud" for value in inputs]
+    return " and ".join(kinds) if kinds else "nothing"
