@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from pydantic import BaseModel, ConfigDict
@@ -43,6 +44,8 @@ class RunContext:
         seed: of everything random.
         force: write the registered cloud though the verdict refuses it.
         done: one entry a finished stage (type, tag, options, seconds, metadata), in order.
+        facts: what holds for the whole run: the pipeline, versions, input files and their hashes.
+        failure: why the registration has nothing to go on with, once a stage said so.
 
     """
 
@@ -52,6 +55,8 @@ class RunContext:
     seed: int = 0
     force: bool = False
     done: list[dict[str, Any]] = field(default_factory=list)
+    facts: dict[str, Any] = field(default_factory=dict)
+    failure: str | None = None
 
 
 class Stage(ABC):
@@ -60,11 +65,16 @@ class Stage(ABC):
     Class attributes:
         type: its name in the JSON, such as "mtpcr.level" or "readers.las".
         Options: the pydantic model of its options.
+        evidence: whether it still runs, with what there is, when the registration failed or was refused;
+            its inputs may then hold None.
+        late: whether it runs after all others, since it tells about the whole run.
 
     """
 
     type: ClassVar[str]
     Options: ClassVar[type[StageOptions]]
+    evidence: ClassVar[bool] = False
+    late: ClassVar[bool] = False
 
     def __init__(self, options: StageOptions, tag: str) -> None:
         self.options = options
@@ -78,6 +88,30 @@ class Stage(ABC):
             MtpcrError: saying what is wrong and what to do.
 
         """
+
+    def check_inputs(self, inputs: Sequence[Value], context: RunContext) -> None:  # noqa: B027
+        """Find out before the run whether these inputs suit, as far as headers tell: kinds, CRS.
+
+        Raises:
+            MtpcrError: saying what is wrong and what to do.
+
+        """
+
+    def open(self, context: RunContext) -> None:  # noqa: B027 - most stages need nothing before their turn
+        """Get ready before the first stage runs."""
+
+    def reads(self) -> list[Path]:
+        """Files this stage reads, as named by its options."""
+        return []
+
+    def writes(self) -> list[Path]:
+        """Files this stage leaves, as named by its options."""
+        return []
+
+    @property
+    def label(self) -> str:
+        """How messages name it."""
+        return f"stage {self.tag} ({self.type})"
 
     @abstractmethod
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:

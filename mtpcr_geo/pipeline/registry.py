@@ -1,0 +1,75 @@
+"""Which stages there are, and how one is made from its words in the JSON."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
+
+from pydantic import ValidationError
+
+from mtpcr_geo.errors import OptionError
+from mtpcr_geo.pipeline.stage import Stage, StageOptions
+from mtpcr_geo.pipeline.words import meant
+
+_MODULES = ("io_stages", "method_stages", "export_stages", "composite")
+
+
+@cache
+def stage_types() -> dict[str, type[Stage]]:
+    """Give every stage the package serves itself, by type, in the order of a run."""
+    found: dict[str, type[Stage]] = {}
+    for name in _MODULES:
+        module = importlib.import_module(f"mtpcr_geo.pipeline.{name}")
+        for value in vars(module).values():
+            if inspect.isclass(value) and issubclass(value, Stage) and not inspect.isabstract(value):
+                kind = getattr(value, "type", None)
+                if isinstance(kind, str):
+                    found.setdefault(kind, value)
+    return found
+
+
+def unknown_type(label: str, kind: str, valid: list[str]) -> OptionError:
+    """Say that there is no such stage, and which one may be meant."""
+    own = [known for known in valid if known.startswith("mtpcr.")]
+    hint = meant(kind, own if kind.startswith("mtpcr.") else valid)
+    return OptionError(f"{label}: there is no stage type {kind!r}{hint}")
+
+
+def make_options(label: str, model: type[StageOptions], words: Mapping[str, Any]) -> StageOptions:
+    """Read a stage's options.
+
+    Raises:
+        OptionError: naming the stage and the option; a misspelt one names the nearest valid one.
+
+    """
+    # PDAL lets every stage carry user_data, for the user's own use
+    words = {key: value for key, value in words.items() if key != "user_data"}
+    try:
+        return model.model_validate(words)
+    except ValidationError as error:
+        raise OptionError(f"{label}: {_first(error, model)}") from None
+
+
+def _first(error: ValidationError, model: type[StageOptions]) -> str:
+    # a misspelt key often causes a missing one too, and says more
+    problems = sorted(
+        error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden"
+    )
+    problem = problems[0]
+    name = ".".join(str(part) for part in problem["loc"]) or "options"
+    names = [field.alias or key for key, field in model.model_fields.items()]
+    if problem["type"] == "extra_forbidden":
+        return f"no option {name!r}{meant(name, names)}"
+    if problem["type"] == "missing":
+        return f"the option {name!r} is missing"
+    message = problem["msg"].removeprefix("Value error, ")
+    message = message[:1].lower() + message[1:]
+    return f"option {name!r}: {message}, got {_short(problem['input'])}"
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
