@@ -42,6 +42,18 @@ class Cloud(ABC):
     def table_chunks(self, size: int = CHUNK_POINTS) -> Iterator[PointTable]:
         """Yield tables of all dimensions by PDAL name (X, Y, Z in float64 first), n <= size rows each."""
 
+    def noise_chunks(
+        self, size: int = CHUNK_POINTS
+    ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
+        """Yield coordinates (n, 3) and which of them are noise or withheld (n,), n <= size.
+
+        Noise is class 7 or 18; it is left out of what is matched, never out of what is written.
+        """
+        from mtpcr_geo.cloud.dimensions import noise_of_table
+
+        for table in self.table_chunks(size):
+            yield np.column_stack([table[axis] for axis in "XYZ"]).astype(np.float64), noise_of_table(table)
+
 
 @dataclass
 class ArrayCloud(Cloud):
@@ -73,8 +85,6 @@ class ArrayCloud(Cloud):
         """Yield tables of all dimensions by PDAL name, n <= size rows each."""
         for start in range(0, self.count, size):
             part = slice(start, start + size)
-            table: dict[str, NDArray[np.generic]] = {
-                axis: self.xyz[part, i] for i, axis in enumerate("XYZ")
-            }
+            table: dict[str, NDArray[np.generic]] = {axis: self.xyz[part, i] for i, axis in enumerate("XYZ")}
             table.update({name: values[part] for name, values in self.extra.items()})
             yield table
