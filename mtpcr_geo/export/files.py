@@ -39,7 +39,9 @@ class OutputSet:
         while not folder.exists():
             folder = folder.parent
         if not folder.is_dir():
-            raise OutputError(f"{folder} is a file, so {final} cannot be written below it; choose another place")
+            raise OutputError(
+                f"{folder} is a file, so {final} cannot be written below it; choose another place"
+            )
         if not os.access(folder, os.W_OK | os.X_OK):
             raise OutputError(f"cannot write to {folder}; choose a folder you may write to")
 
@@ -71,6 +73,10 @@ class OutputSet:
         for path in reversed(missing):
             path.mkdir()
             self._made_folders.append(path)
+
+    def written(self) -> list[Path]:
+        """Say what has been written so far and waits to be put in place, in order."""
+        return [final for final, part in self._parts.items() if part.exists()]
 
     def commit(self) -> list[Path]:
         """Put everything in place and say what was written, in order.

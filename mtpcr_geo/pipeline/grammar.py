@@ -203,7 +203,8 @@ def _load(text: str | bytes, where: str) -> Any:
             text = text.decode("utf-8-sig")
         except UnicodeDecodeError as error:
             raise OptionError(
-                f"{where} is not UTF-8 text (byte {error.start} is 0x{text[error.start]:02x}); save it as UTF-8"
+                f"{where} is not UTF-8 text (byte {error.start} is 0x{text[error.start]:02x}); "
+                "save it as UTF-8"
             ) from error
     try:
         return json.loads(

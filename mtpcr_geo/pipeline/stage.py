@@ -26,6 +26,9 @@ class StageOptions(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+OptionsModel = type[StageOptions]
+
+
 class Progress(Protocol):
     """Where long work says how far it is."""
 
@@ -72,7 +75,7 @@ class Stage(ABC):
     """
 
     type: ClassVar[str]
-    Options: ClassVar[type[StageOptions]]
+    Options: ClassVar[OptionsModel]
     evidence: ClassVar[bool] = False
     late: ClassVar[bool] = False
 

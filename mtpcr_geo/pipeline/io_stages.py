@@ -1,0 +1,230 @@
+"""Readers and writers served without PDAL, under PDAL's names and options."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from mtpcr_geo.cloud.base import Cloud
+from mtpcr_geo.errors import CrsError, OptionError
+from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
+from mtpcr_geo.pipeline.views import Box, Cropped, Head, Moved, parse_bounds
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+
+def _path_of(value: Any) -> Any:
+    # PDAL from 2.9 on also takes {"path": ...}
+    return value.get("path", value) if isinstance(value, Mapping) else value
+
+
+def _listed(value: Any) -> Any:
+    return [value] if isinstance(value, str) else value
+
+
+def _checked_bounds(values: list[str]) -> list[str]:
+    for value in values:
+        parse_bounds(value)
+    return values
+
+
+FileName = Annotated[Path, BeforeValidator(_path_of)]
+Bounds = Annotated[list[str], BeforeValidator(_listed), Field(min_length=1)]
+
+
+class LasReaderOptions(StageOptions):
+    """Options of readers.las."""
+
+    filename: FileName = Field(description="file to read: LAS 1.0-1.4, LAZ or COPC")
+    count: int | None = Field(None, ge=1, description="read at most this many points, from the first on")
+    override_srs: str | None = Field(None, description="CRS to take instead of what the file states")
+    default_srs: str | None = Field(None, description="CRS to take where the file states none")
+
+
+class LasReader(Stage):
+    """Read LAS, LAZ or COPC; points are streamed when a later stage asks for them."""
+
+    type: ClassVar[str] = "readers.las"
+    Options: ClassVar[OptionsModel] = LasReaderOptions
+    options: LasReaderOptions
+
+    def reads(self) -> list[Path]:
+        """Name the file."""
+        return [self.options.filename]
+
+    def check(self, context: RunContext) -> None:
+        """Open the header, and read the CRS options."""
+        self._open()
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Give the cloud, known by its header."""
+        cloud = self._open()
+        self.metadata |= {
+            "filename": str(self.options.filename),
+            "count": cloud.count,
+            "minimum": cloud.minimum.tolist(),
+            "maximum": cloud.maximum.tolist(),
+            "srs": cloud.crs.to_wkt() if cloud.crs is not None else "",
+        }
+        return cloud
+
+    def _open(self) -> Cloud:
+        from mtpcr_geo.cloud.las import open_cloud
+
+        override = self._crs("override_srs", self.options.override_srs)
+        default = self._crs("default_srs", self.options.default_srs)
+        cloud: Cloud = open_cloud(self.options.filename, override)
+        if cloud.crs is None and default is not None:
+            cloud = open_cloud(self.options.filename, default)
+        if self.options.count is not None and self.options.count < cloud.count:
+            cloud = Head(cloud, self.options.count)
+        return cloud
+
+    def _crs(self, option: str, text: str | None) -> CRS | None:
+        return parse_crs(text, f"{self.label}: option {option!r}") if text else None
+
+
+class CopcReaderOptions(LasReaderOptions):
+    """Options of readers.copc."""
+
+    bounds: Bounds | None = Field(
+        None, description='keep what lies in "([xmin, xmax], [ymin, ymax])", in the file\'s units'
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> CopcReaderOptions:
+        _checked_bounds(self.bounds or [])
+        return self
+
+
+class CopcReader(LasReader):
+    """Read COPC, whole or within bounds."""
+
+    type: ClassVar[str] = "readers.copc"
+    Options = CopcReaderOptions
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Give the cloud, cropped where bounds are given."""
+        cloud = super().run(inputs, context)
+        bounds = self.options.bounds if isinstance(self.options, CopcReaderOptions) else None
+        if bounds is None or not isinstance(cloud, Cloud):
+            return cloud
+        return Cropped(cloud, [parse_bounds(text) for text in bounds])
+
+
+class CropOptions(StageOptions):
+    """Options of filters.crop, as far as it is served without PDAL."""
+
+    bounds: Bounds = Field(description='keep what lies in "([xmin, xmax], [ymin, ymax])"; several join')
+    outside: bool = Field(False, description="keep what lies outside instead")
+
+    @model_validator(mode="after")
+    def _check(self) -> CropOptions:
+        _checked_bounds(self.bounds)
+        return self
+
+    @property
+    def boxes(self) -> list[Box]:
+        """The bounds, read."""
+        return [parse_bounds(text) for text in self.bounds]
+
+
+class Crop(Stage):
+    """Keep the points within bounds."""
+
+    type = "filters.crop"
+    Options = CropOptions
+    options: CropOptions
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Give the cloud cropped; points stream through."""
+        return Cropped(one_cloud(self, inputs), self.options.boxes, self.options.outside)
+
+
+class LasWriterOptions(StageOptions):
+    """Options of writers.las, as far as it is served without PDAL."""
+
+    filename: FileName = Field(description="file to write: LAS 1.4; .laz is compressed")
+    a_srs: str | None = Field(None, description="CRS to state instead of the cloud's own")
+
+
+class LasWriter(Stage):
+    """Write LAS 1.4 or LAZ: point format 6 or up, WKT, every dimension and extra byte kept."""
+
+    type: ClassVar[str] = "writers.las"
+    Options = LasWriterOptions
+    options: LasWriterOptions
+
+    def writes(self) -> list[Path]:
+        """Name the file."""
+        return [self.options.filename]
+
+    def check(self, context: RunContext) -> None:
+        """Read the CRS option."""
+        if self.options.a_srs:
+            parse_crs(self.options.a_srs, f"{self.label}: option 'a_srs'")
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Stream the cloud to the file, and hand it on."""
+        from mtpcr_geo.cloud.write import write_cloud
+
+        cloud = one_cloud(self, inputs)
+        crs = (
+            parse_crs(self.options.a_srs, f"{self.label}: option 'a_srs'")
+            if self.options.a_srs
+            else cloud.crs
+        )
+        path = context.outputs.path(self.options.filename)
+        if isinstance(cloud, Moved):
+            write_cloud(path, cloud.base, cloud.move, crs)
+        else:
+            write_cloud(path, cloud, None, crs)
+        self.metadata |= {"filename": str(self.options.filename), "count": cloud.count}
+        return cloud
+
+
+class CopcWriter(LasWriter):
+    """Write COPC."""
+
+    type: ClassVar[str] = "writers.copc"
+
+
+def one_cloud(stage: Stage, inputs: Sequence[Value]) -> Cloud:
+    """Take the single cloud among a stage's inputs.
+
+    Raises:
+        OptionError: if the inputs are something else.
+
+    """
+    if len(inputs) == 1 and isinstance(inputs[0], Cloud):
+        return inputs[0]
+    if len(inputs) == 1:
+        raise OptionError(
+            f"{stage.label} needs a cloud and got a pair of clouds; put mtpcr.apply before it, which moves the source"
+        )
+    raise OptionError(
+        f"{stage.label} needs one cloud and got {len(inputs)} inputs; name one in its inputs, "
+        "or join them by PDAL's filters.merge"
+    )
+
+
+def parse_crs(text: str, where: str) -> CRS:
+    """Read what a user wrote as a coordinate reference system.
+
+    Raises:
+        CrsError: if PROJ knows no such system.
+
+    """
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        return CRS.from_user_input(text)
+    except CRSError as error:
+        raise CrsError(
+            f"{where}: {text!r} is no coordinate reference system that PROJ knows; write it like EPSG:2154"
+        ) from error

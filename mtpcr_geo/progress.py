@@ -1,0 +1,59 @@
+"""Where long work says how far it is: bars on a terminal, or nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+Advance = Callable[[int], None]
+
+
+class NoProgress:
+    """Says nothing."""
+
+    @contextmanager
+    def task(self, what: str, total: int | None = None) -> Iterator[Advance]:
+        """Open a task that nobody hears of."""
+        yield lambda count: None
+
+
+class RichProgress:
+    """Bars on a console, gone when the work is done; nothing where the console is no terminal.
+
+    Use as a context manager around the whole run.
+    """
+
+    def __init__(self, console: Console) -> None:
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        self._bars = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+
+    def __enter__(self) -> Self:
+        self._bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bars.stop()
+
+    @contextmanager
+    def task(self, what: str, total: int | None = None) -> Iterator[Advance]:
+        """Open a bar, or a pulsing one where the total is not known."""
+        bar = self._bars.add_task(what, total=total)
+        try:
+            yield lambda count: self._bars.advance(bar, count)
+        finally:
+            self._bars.remove_task(bar)
