@@ -67,7 +67,8 @@ def noise_of_table(table: PointTable) -> NDArray[np.bool_]:
 
 
 def _noise(classification: NDArray[Any], withheld: NDArray[Any]) -> NDArray[np.bool_]:
-    return (classification == LOW_NOISE) | (classification == HIGH_NOISE) | (withheld != 0)
+    noise = (classification == LOW_NOISE) | (classification == HIGH_NOISE) | (withheld != 0)
+    return np.asarray(noise, bool)
 
 
 def split_classification(
@@ -79,7 +80,8 @@ def split_classification(
     formats 6 and up, and in the upper three bits of ``Classification`` for the others.
 
     Returns:
-        The classes (n,), or None if there are none; and Synthetic, KeyPoint, Withheld, Overlap, (n,) of 0 or 1.
+        The classes (n,), or None if there are none; and Synthetic, KeyPoint, Withheld and Overlap,
+        each (n,) of 0 or 1.
 
     """
     names = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
@@ -90,11 +92,15 @@ def split_classification(
         flags = {name: np.asarray(table.get(name, none)).astype(np.uint8) for name in names}
     elif "ClassFlags" in table:
         bits = np.asarray(table["ClassFlags"]).astype(np.uint8)
-        flags = {name: (bits >> place) & 1 for place, name in enumerate(names)}
+        flags = {name: _bit(bits, place) for place, name in enumerate(names)}
     elif classification is not None:
-        flags = {name: (classification >> (5 + place)) & 1 for place, name in enumerate(names[:3])}
+        flags = {name: _bit(classification, 5 + place) for place, name in enumerate(names[:3])}
         flags["Overlap"] = none
-        classification = classification & 31
+        classification = (classification & 31).astype(np.uint8)
     else:
         flags = dict.fromkeys(names, none)
     return classification, flags
+
+
+def _bit(values: NDArray[np.uint8], place: int) -> NDArray[np.uint8]:
+    return ((values >> place) & 1).astype(np.uint8)

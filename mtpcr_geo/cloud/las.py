@@ -216,5 +216,6 @@ def check_distinct(target: Cloud, source: Cloud) -> None:
     same_size = target.path.stat().st_size == source.path.stat().st_size
     if same_size and sha256(target.path) == sha256(source.path):
         raise InputError(
-            f"source and target hold the same bytes ({source.path} and {target.path}); give two different clouds"
+            f"source and target hold the same bytes ({source.path} and {target.path}); "
+            "give two different clouds"
         )

@@ -148,8 +148,9 @@ def _check_finite(cloud: Cloud, xyz: Floats, before: int) -> None:
         return
     bad = ~np.isfinite(xyz).all(axis=1)
     if bad.any():
+        first = before + int(bad.argmax())
         raise InputError(
-            f"{cloud.name} has coordinates that are not finite (first at point {before + int(bad.argmax())}); "
+            f"{cloud.name} has coordinates that are not finite (first at point {first}); "
             "remove those points, or check the header's scales and offsets"
         )
 
@@ -158,7 +159,8 @@ def _check_usable(cloud: Cloud, count: int, dropped: int, minimum: Floats, maxim
     good = count - dropped
     if good == 0:
         raise InputError(
-            f"every point of {cloud.name} is classified as noise or withheld; reclassify it or give another cloud"
+            f"every point of {cloud.name} is classified as noise or withheld; "
+            "reclassify it or give another cloud"
         )
     extent = maximum - minimum
     if count == 1:
