@@ -1,0 +1,291 @@
+"""The default matcher: a global search by correlation, judged at fine cells, then local patch matches.
+
+The search works coarse to fine. A level proposes hypotheses; each is followed down to the finest cells and
+scored there, in one common way. Where the best stands clearly above the next distinct one and its patches
+agree with each other, the search ends; else the next finer level is searched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo import geometry
+from mtpcr_geo.bev import coarsen
+from mtpcr_geo.enhance import channels
+from mtpcr_geo.errors import RegistrationError
+from mtpcr_geo.match.local import PatchMatches, match_patches
+from mtpcr_geo.match.pose import Pose, centre_of, pose_of
+from mtpcr_geo.match.search import GlobalSearch, Layer, angle_between, distinct, score_nearby
+from mtpcr_geo.scene import Bev, Matches
+from mtpcr_geo.solve import iterative_svd, ransac_upright
+
+Floats = NDArray[np.float64]
+
+SEARCH_CELLS_M = (8.0, 4.0, 2.0)
+LARGEST_SEARCH = 420
+"""Cells along a raster's side up to which a level is searched over all yaws in about two seconds."""
+PEAKS_A_YAW = 3
+HYPOTHESES = 6
+JUDGED_BY_PATCHES = 2
+
+
+@dataclass(frozen=True)
+class CorrelationSettings:
+    """What governs the search.
+
+    Attributes:
+        yaw_step_deg: step of the search over all yaws.
+        patch_m: edge of a patch of the local matches, metres.
+        reach_m: how far a patch may lie from where the hypothesis puts it, metres.
+        min_overlap_m2: smallest overlap considered, square metres.
+        min_overlap_share: smallest overlap considered, as a share of the smaller raster.
+        convincing_margin: best over next distinct score at fine cells that ends the search.
+        convincing_support: share of patch matches that must agree on one pose to end it.
+
+    """
+
+    yaw_step_deg: float = 4.0
+    patch_m: float = 24.0
+    reach_m: float = 6.0
+    min_overlap_m2: float = 400.0
+    min_overlap_share: float = 0.03
+    convincing_margin: float = 1.5
+    convincing_support: float = 0.5
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A hypothesis followed down to the finest cells.
+
+    Attributes:
+        pose: about the fine source raster's centre, with its score there.
+        proposed: score at the level that proposed it.
+        patches: local matches under it, where it was judged by them.
+        supporting: (n,) patches that agree on one pose.
+
+    """
+
+    pose: Pose
+    proposed: float
+    patches: PatchMatches | None = None
+    supporting: NDArray[np.bool_] | None = None
+
+    @property
+    def support(self) -> float:
+        """Share of all patches tried that found a peak and agree on one pose."""
+        if self.patches is None or self.supporting is None or not self.patches.patches:
+            return 0.0
+        return float(self.supporting.sum()) / self.patches.patches
+
+
+def match(
+    source: Bev,
+    target: Bev,
+    settings: CorrelationSettings,
+    seed: int = 0,
+    advance: Callable[[int], object] = lambda n: None,
+) -> Matches:
+    """Match two height rasters of unknown relative yaw and shift.
+
+    Args:
+        source, target: rasters of one cell size, in levelled coordinates.
+        settings: what governs the search.
+        seed: of the sampling when patches vote.
+        advance: called with 1 after each yaw searched.
+
+    Returns:
+        Local matches under the best hypothesis (possibly few), and all hypotheses, best first.
+
+    Raises:
+        RegistrationError: if the rasters are too small or too empty to overlap enough.
+
+    """
+    pyramid = Pyramid(source, target)
+    levels = search_factors(source, target)
+    pool: list[Candidate] = []
+    report: dict[str, Any] = {"cell_m": source.grid.cell, "searched": []}
+    for factor in levels:
+        found = _search(pyramid, factor, settings, advance)
+        report["searched"].append(
+            {"cell_m": source.grid.cell * factor, "scores": [round(pose.score, 3) for pose in found]}
+        )
+        pool = _rank([*pool, *(_descend(pyramid, factor, pose) for pose in found)])
+        pool = [
+            _judge_by_patches(pyramid, candidate, settings, seed) if i < JUDGED_BY_PATCHES else candidate
+            for i, candidate in enumerate(pool)
+        ]
+        pool = sorted(pool, key=lambda c: -c.pose.score)
+        if (
+            pool
+            and margin_of(pool) >= settings.convincing_margin
+            and pool[0].support >= settings.convincing_support
+        ):
+            break
+    if not pool:
+        raise RegistrationError(
+            "no pose brings the two rasters to overlap enough to compare; the clouds may be too small or too "
+            f"sparse for cells of {source.grid.cell:g} m: give a finer --cell, or larger clouds"
+        )
+    best = pool[0]
+    matches = best.patches
+    assert matches is not None  # the best hypotheses are always judged by patches
+    pivot = centre_of(source.grid)
+    report |= {
+        "margin": margin_of(pool),
+        "support": best.support,
+        "support_next": max((c.support for c in pool[1:]), default=0.0),
+        "patches": matches.patches,
+        "scores": [round(c.pose.score, 3) for c in pool],
+    }
+    return Matches(
+        source_px=matches.source_px,
+        target_px=matches.target_px,
+        score=np.clip(matches.score, 0.0, 1.0),
+        hypotheses=tuple(c.pose.hypothesis(pivot) for c in pool),
+        report=report,
+    )
+
+
+class Pyramid:
+    """Both rasters' channels at every cell size asked for, made once."""
+
+    def __init__(self, source: Bev, target: Bev) -> None:
+        self._bevs = (source, target)
+        self._layers: dict[int, tuple[Layer, Layer]] = {}
+
+    def at(self, factor: int) -> tuple[Layer, Layer]:
+        """Give source and target layers at ``factor`` times the finest cell."""
+        if factor not in self._layers:
+            coarse = [coarsen(bev, factor) for bev in self._bevs]
+            source, target = (Layer(bev.grid, channels(bev)) for bev in coarse)
+            self._layers[factor] = (source, target)
+        return self._layers[factor]
+
+
+def search_factors(source: Bev, target: Bev) -> list[int]:
+    """Choose the levels of the global search, coarsest first, as multiples of the finest cell.
+
+    The coarsest that still leaves a few dozen cells along the smaller raster, down to the finest that can
+    be searched over all yaws in about two seconds.
+    """
+    cell = source.grid.cell
+    longest = max(max(bev.grid.shape) for bev in (source, target)) * cell
+    shortest = min(max(bev.grid.shape) for bev in (source, target)) * cell
+    factors = []
+    for wanted in SEARCH_CELLS_M:
+        factor = max(1, round(wanted / cell))
+        size = factor * cell
+        if shortest / size >= 40 and longest / size <= LARGEST_SEARCH and factor not in factors:
+            factors.append(factor)
+    if not factors:
+        fitting = max(longest / LARGEST_SEARCH, min(shortest / 40, SEARCH_CELLS_M[1]))
+        factors.append(max(1, int(np.ceil(fitting / cell))))
+    return factors
+
+
+def margin_of(pool: Sequence[Candidate]) -> float:
+    """Best score over that of the next distinct hypothesis; infinite where there is no other."""
+    if len(pool) < 2:
+        return float("inf")
+    return pool[0].pose.score / max(pool[1].pose.score, 1e-9)
+
+
+def _search(
+    pyramid: Pyramid, factor: int, settings: CorrelationSettings, advance: Callable[[int], object]
+) -> list[Pose]:
+    source, target = pyramid.at(factor)
+    cell = source.grid.cell
+    smaller = min(float(layer.channels.mask.sum()) for layer in (source, target))
+    fewest = max(settings.min_overlap_m2 / cell**2, settings.min_overlap_share * smaller)
+    steps = round(360.0 / settings.yaw_step_deg)
+    yaws = np.arange(steps) * (2 * np.pi / steps)
+    search = GlobalSearch(source, target, fewest)
+    poses = search.run(yaws, PEAKS_A_YAW, 4, advance)
+    return distinct(poses, HYPOTHESES, np.radians(2 * settings.yaw_step_deg), 5 * cell)
+
+
+def _descend(pyramid: Pyramid, factor: int, pose: Pose) -> Candidate:
+    """Follow a hypothesis from the level that proposed it to the finest cells."""
+    proposed = pose.score
+    level, step = factor, 1.0
+    window = 2
+    while True:
+        source, target = pyramid.at(level)
+        tries = [
+            score_nearby(
+                source, target, Pose(pose.yaw + np.radians(k * step), pose.east, pose.north), window
+            )[0]
+            for k in (-2, -1, 0, 1, 2)
+        ]
+        pose = max(tries, key=lambda p: p.score)
+        if level == 1:
+            return Candidate(pose, proposed)
+        finer = max(1, level // 2)
+        # the centre of the raster moves a little between levels: same pose, other pivot
+        hypothesis = pose.hypothesis(centre_of(source.grid))
+        pose = pose_of(hypothesis, centre_of(pyramid.at(finer)[0].grid))
+        level, step, window = finer, step / 2, 3
+
+
+def _rank(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Sort by the score at fine cells, and join those that came down to the same place."""
+    kept: list[Candidate] = []
+    for candidate in sorted(candidates, key=lambda c: -c.pose.score):
+        if not np.isfinite(candidate.pose.score):
+            continue
+        if all(not _same(candidate.pose, other.pose) for other in kept):
+            kept.append(candidate)
+    return kept[:HYPOTHESES]
+
+
+def _same(a: Pose, b: Pose) -> bool:
+    return (
+        angle_between(a.yaw, b.yaw) < np.radians(5.0) and np.hypot(a.east - b.east, a.north - b.north) < 12.0
+    )
+
+
+def _judge_by_patches(
+    pyramid: Pyramid, candidate: Candidate, settings: CorrelationSettings, seed: int
+) -> Candidate:
+    """Match patches around a hypothesis, let them correct it, and match again from there."""
+    if candidate.patches is not None:
+        return candidate
+    source, target = pyramid.at(1)
+    cell = source.grid.cell
+    stride = max(4, round(settings.patch_m / 2 / cell))
+    window = max(3, round(settings.reach_m / cell))
+    pose, patches = candidate.pose, None
+    supporting = np.zeros(0, bool)
+    for reach in (window, max(3, window // 2)):
+        patches = match_patches(source, target, pose, window=reach, stride=stride)
+        s, t = source.grid.to_metres(patches.source_px), target.grid.to_metres(patches.target_px)
+        T, supporting = ransac_upright(s, t, 1.5 * cell, seed, 500)
+        if supporting.sum() < 4:
+            break
+        flat = np.zeros((len(s), 1))
+        solution = iterative_svd(
+            np.hstack([s, flat]),
+            np.hstack([t, flat]),
+            start=supporting,
+            weight=patches.score**2,
+            floor=1.5 * cell,
+            upright=True,
+        )
+        pivot = centre_of(source.grid)
+        place = geometry.apply(solution.T, np.array([[pivot[0], pivot[1], 0.0]]))[0]
+        yaw = geometry.yaw_of(solution.T[:3, :3])
+        pose = Pose(yaw, float(place[0]), float(place[1]), pose.score, pose.overlap_cells)
+    rescored = score_nearby(source, target, pose, 1)[0]
+    if rescored.score < candidate.pose.score:
+        # patches that do not agree must not carry a good hypothesis away
+        rescored = candidate.pose
+        patches = match_patches(source, target, rescored, window=max(3, window // 2), stride=stride)
+        s, t = source.grid.to_metres(patches.source_px), target.grid.to_metres(patches.target_px)
+        _, supporting = ransac_upright(s, t, 1.5 * cell, seed, 500)
+    assert patches is not None
+    return Candidate(rescored, candidate.proposed, patches, supporting)

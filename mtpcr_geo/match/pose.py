@@ -1,0 +1,83 @@
+"""Poses between two rasters: yaw and the place where the source raster's centre lands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo.raster import Grid
+from mtpcr_geo.scene import Hypothesis
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A candidate pose about the source raster's centre, where yaw and shift hardly interact.
+
+    Attributes:
+        yaw: radians, counter-clockwise seen from above.
+        east, north: where the centre of the source raster comes to lie, metres in the target's frame.
+        score: correlation score.
+        overlap_cells: cells filled in both.
+
+    """
+
+    yaw: float
+    east: float
+    north: float
+    score: float = 0.0
+    overlap_cells: int = 0
+
+    def hypothesis(self, pivot: Floats) -> Hypothesis:
+        """Express it as ``target = Rz(yaw) source + shift``; pivot (2,) is the source raster's centre."""
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        x, y = pivot
+        shift = (self.east - (c * x - s * y), self.north - (s * x + c * y))
+        return Hypothesis(self.yaw, (float(shift[0]), float(shift[1])), self.score, self.overlap_cells)
+
+
+def pose_of(hypothesis: Hypothesis, pivot: Floats) -> Pose:
+    """Express a hypothesis about the source raster's centre ``pivot`` (2,)."""
+    c, s = np.cos(hypothesis.yaw), np.sin(hypothesis.yaw)
+    x, y = pivot
+    east, north = c * x - s * y + hypothesis.shift[0], s * x + c * y + hypothesis.shift[1]
+    return Pose(hypothesis.yaw, float(east), float(north), hypothesis.score, hypothesis.overlap_cells)
+
+
+def centre_of(grid: Grid) -> Floats:
+    """Centre of a raster, (2,) metres."""
+    return np.array([grid.west + grid.width * grid.cell / 2, grid.north - grid.height * grid.cell / 2])
+
+
+def warp_to(source: Image, source_grid: Grid, target_grid: Grid, pose: Pose) -> Image:
+    """Bring source images onto the target's grid under a pose, bilinearly.
+
+    Args:
+        source: (k, h, w) images on ``source_grid``; 0 means empty.
+        source_grid, target_grid: grids in metres of their own frames.
+        pose: the pose.
+
+    Returns:
+        (k, H, W) float32 on ``target_grid``, 0 where the source does not reach.
+
+    """
+    M = source_from_target_pixels(source_grid, target_grid, pose)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    size = (target_grid.width, target_grid.height)
+    return np.stack([cv2.warpAffine(image, M, size, flags=flags) for image in source])
+
+
+def source_from_target_pixels(source_grid: Grid, target_grid: Grid, pose: Pose) -> Floats:
+    """Give the (2, 3) affine map from target pixels to source pixels under a pose."""
+    pivot = centre_of(source_grid)
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    offset = target_grid.to_metres(corners) - np.array([pose.east, pose.north])
+    c, s = np.cos(pose.yaw), np.sin(pose.yaw)
+    metres = offset @ np.array([[c, -s], [s, c]]) + pivot
+    px = source_grid.to_pixel(metres)
+    return np.stack([px[1] - px[0], px[2] - px[0], px[0]], axis=1)

@@ -1,0 +1,240 @@
+"""The global search: every yaw and every shift, by masked correlation in the frequency domain.
+
+For each yaw the source channels are turned and correlated with the target's. The score of a shift is the
+sum over both channels of the masked normalised correlation, times the square root of the cells that overlap:
+a measure of how unlikely the agreement is by chance, comparable between small and large overlaps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from mtpcr_geo.enhance import Channels
+from mtpcr_geo.match.pose import Pose, centre_of, warp_to
+from mtpcr_geo.raster import Grid
+
+Image = NDArray[np.float32]
+Spectrum = NDArray[np.complex64]
+
+HEIGHT_FLOOR_M = 0.1
+STEP_FLOOR = 0.02
+"""Standard deviations below which an image shows nothing but noise: they bound the denominators."""
+FILLED = 0.5
+"""Share of a turned cell that must come from filled cells for it to count as filled."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Channels on their grid: what is matched at one level of the pyramid."""
+
+    grid: Grid
+    channels: Channels
+
+
+def correlation_score(
+    overlap: Image,
+    products: tuple[Image, Image],
+    source_squares: tuple[Image, Image],
+    target_squares: tuple[Image, Image],
+) -> Image:
+    """Score from sums over the overlapping cells: sum of both normalised correlations times sqrt(overlap).
+
+    Each correlation is at most 1 by Cauchy and Schwarz, since all three sums run over the same cells; the
+    floors keep that true where rounding in the transform exceeds what little signal there is.
+
+    Args:
+        overlap: cells filled in both images.
+        products: per channel, the sum of source times target.
+        source_squares, target_squares: per channel, the sums of squares.
+
+    """
+    cells = np.maximum(overlap, 1.0)
+    total = np.zeros_like(cells)
+    for product, ss, tt, floor in zip(
+        products, source_squares, target_squares, (HEIGHT_FLOOR_M, STEP_FLOOR), strict=True
+    ):
+        least = cells * np.float32(floor**2)
+        total += np.clip(product / np.sqrt(np.maximum(ss, least) * np.maximum(tt, least)), -1.0, 1.0)
+    return np.asarray(total * np.sqrt(cells), np.float32)
+
+
+class GlobalSearch:
+    """Correlates a source with a target under any yaw.
+
+    Args:
+        source, target: channels on grids of one cell size.
+        min_overlap_cells: overlaps below this are not considered.
+        workers: threads of the transforms.
+
+    """
+
+    def __init__(self, source: Layer, target: Layer, min_overlap_cells: float, workers: int = 2) -> None:
+        self.source = source
+        self.target = target
+        self.min_overlap = max(min_overlap_cells, 1.0)
+        self.workers = workers
+        side = int(np.ceil(np.hypot(*source.grid.shape))) + 2
+        self._turned_side = side
+        height, width = target.grid.shape
+        self._shape = tuple(scipy.fft.next_fast_len(n + side - 1, real=True) for n in (height, width))
+        self._target_spectra = self._spectra(target.channels.stack())
+
+    def _spectra(self, stack: Image) -> Spectrum:
+        """Transform height, steps, mask and the squares of the first two: (5, ...)."""
+        five = np.concatenate([stack, stack[:2] ** 2])
+        return np.asarray(scipy.fft.rfft2(five, self._shape, workers=self.workers))
+
+    def _turned(self, yaw: float) -> tuple[Image, Grid]:
+        """Turn the source about its centre onto a square grid large enough for any yaw."""
+        grid = self.source.grid
+        side, half = self._turned_side, self._turned_side * grid.cell / 2
+        square = Grid(-half, half, grid.cell, side, side)
+        stack = warp_to(self.source.channels.stack(), grid, square, Pose(yaw, 0.0, 0.0))
+        mask = (stack[2] > FILLED).astype(np.float32)
+        return np.stack([stack[0] * mask, stack[1] * mask, mask]), square
+
+    def scores(self, yaw: float) -> tuple[Image, Image]:
+        """Score every shift under one yaw: scores and overlapping cells, both over cyclic shifts."""
+        turned, _ = self._turned(yaw)
+        a, e, m, aa, ee = self._spectra(turned).conj()
+        A, E, M, AA, EE = self._target_spectra
+        overlap, pa, pe, sa, se, ta, te = scipy.fft.irfft2(
+            np.stack([m * M, a * A, e * E, aa * M, ee * M, m * AA, m * EE]), self._shape, workers=self.workers
+        )
+        score = correlation_score(overlap, (pa, pe), (sa, se), (ta, te))
+        return np.where(overlap >= self.min_overlap, score, -np.inf), overlap
+
+    def peaks(self, yaw: float, count: int, apart_cells: int) -> list[Pose]:
+        """Find the best shifts under one yaw, at least ``apart_cells`` from each other."""
+        score, overlap = self.scores(yaw)
+        rows, columns = self._shape
+        found = []
+        for _ in range(count):
+            row, column = np.unravel_index(int(np.argmax(score)), score.shape)
+            if not np.isfinite(score[row, column]):
+                break
+            dy = row if row < self.target.grid.height else row - rows
+            dx = column if column < self.target.grid.width else column - columns
+            half = self._turned_side / 2
+            grid = self.target.grid
+            found.append(
+                Pose(
+                    yaw,
+                    float(grid.west + (dx + half) * grid.cell),
+                    float(grid.north - (dy + half) * grid.cell),
+                    float(score[row, column]),
+                    round(float(overlap[row, column])),
+                )
+            )
+            near_rows = np.arange(row - apart_cells, row + apart_cells + 1) % rows
+            near_columns = np.arange(column - apart_cells, column + apart_cells + 1) % columns
+            score[np.ix_(near_rows, near_columns)] = -np.inf
+        return found
+
+    def run(
+        self, yaws: Iterable[float], per_yaw: int, apart_cells: int, advance: Callable[[int], object]
+    ) -> list[Pose]:
+        """Search all yaws; best first. ``advance`` is called with 1 after each yaw."""
+        poses: list[Pose] = []
+        for yaw in yaws:
+            poses += self.peaks(yaw, per_yaw, apart_cells)
+            advance(1)
+        return sorted(poses, key=lambda pose: -pose.score)
+
+
+def angle_between(a: float, b: float) -> float:
+    """Absolute difference of two angles in radians, 0..pi."""
+    return abs((a - b + np.pi) % (2 * np.pi) - np.pi)
+
+
+def distinct(poses: Iterable[Pose], count: int, yaw_apart: float, metres_apart: float) -> list[Pose]:
+    """Keep the best poses that truly differ, in the order given.
+
+    Args:
+        poses: candidates, best first.
+        count: how many at most.
+        yaw_apart: radians; poses closer in yaw and place are one hypothesis.
+        metres_apart: distance of the source raster's centre, metres.
+
+    """
+    kept: list[Pose] = []
+    for pose in poses:
+        if all(
+            angle_between(pose.yaw, other.yaw) > yaw_apart
+            or np.hypot(pose.east - other.east, pose.north - other.north) > metres_apart
+            for other in kept
+        ):
+            kept.append(pose)
+            if len(kept) == count:
+                break
+    return kept
+
+
+def score_nearby(source: Layer, target: Layer, pose: Pose, window: int) -> tuple[Pose, Image]:
+    """Score a pose and all shifts within ``window`` cells of it; give the best and the score window.
+
+    Only the part of the target under the source is looked at, so it costs little at fine cells.
+    """
+    part, offset = _target_under(source.grid, target.grid, pose, window)
+    side = 2 * window + 1
+    nothing = np.full((side, side), -np.inf, np.float32)
+    if part.width <= 2 * window or part.height <= 2 * window:
+        return Pose(pose.yaw, pose.east, pose.north, -np.inf, 0), nothing
+    warped = warp_to(source.channels.stack(), source.grid, part, pose)
+    inner = (slice(window, part.height - window), slice(window, part.width - window))
+    mask = (warped[2] > FILLED).astype(np.float32)[inner]
+    a, e = (warped[0][inner] * mask).ravel(), (warped[1][inner] * mask).ravel()
+    m = mask.ravel()
+    row0, column0 = offset
+    rows, columns = inner[0].stop - window, inner[1].stop - window
+    stack = target.channels.stack()[:, row0 : row0 + part.height, column0 : column0 + part.width]
+    sums = np.empty((7, side, side), np.float32)
+    aa, ee = a * a, e * e
+    for dy in range(side):
+        for dx in range(side):
+            A, E, M = (c.ravel() for c in stack[:, dy : dy + rows, dx : dx + columns])
+            mA, mE = m * A, m * E
+            sums[:, dy, dx] = (m @ M, a @ A, e @ E, aa @ M, ee @ M, mA @ A, mE @ E)
+    overlap = sums[0]
+    score = correlation_score(overlap, (sums[1], sums[2]), (sums[3], sums[4]), (sums[5], sums[6]))
+    dy, dx = np.unravel_index(int(np.argmax(score)), score.shape)
+    cell = target.grid.cell
+    best = Pose(
+        pose.yaw,
+        pose.east + (int(dx) - window) * cell,
+        pose.north - (int(dy) - window) * cell,
+        float(score[dy, dx]),
+        round(float(overlap[dy, dx])),
+    )
+    return best, score
+
+
+def _target_under(source: Grid, target: Grid, pose: Pose, margin: int) -> tuple[Grid, tuple[int, int]]:
+    """Cut from the target's grid what the posed source can reach, plus a margin of cells."""
+    half_w, half_h = source.width * source.cell / 2, source.height * source.cell / 2
+    corners = np.array([[-half_w, -half_h], [half_w, -half_h], [half_w, half_h], [-half_w, half_h]])
+    c, s = np.cos(pose.yaw), np.sin(pose.yaw)
+    placed = corners @ np.array([[c, s], [-s, c]]) + [pose.east, pose.north]
+    px = target.to_pixel(placed)
+    column0 = int(np.clip(np.floor(px[:, 0].min()) - margin, 0, target.width))
+    row0 = int(np.clip(np.floor(px[:, 1].min()) - margin, 0, target.height))
+    column1 = int(np.clip(np.ceil(px[:, 0].max()) + margin + 1, column0, target.width))
+    row1 = int(np.clip(np.ceil(px[:, 1].max()) + margin + 1, row0, target.height))
+    part = Grid(
+        target.west + column0 * target.cell,
+        target.north - row0 * target.cell,
+        target.cell,
+        column1 - column0,
+        row1 - row0,
+    )
+    return part, (row0, column0)
+
+
+def pivot_of(layer: Layer) -> NDArray[np.float64]:
+    """Pivot of poses of this source layer: the centre of its raster, (2,) metres."""
+    return centre_of(layer.grid)

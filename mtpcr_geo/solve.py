@@ -1,0 +1,170 @@
+"""From ties to a rigid transform: iterative SVD with outlier rejection, and a robust start for it.
+
+One SVD over many outliers does not recover, however often it is repeated; with gravity known only a yaw and
+a shift remain, two ties determine them, and RANSAC over pairs of ties gives a start that does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo import geometry
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def fit_rigid(source: Floats, target: Floats, weight: Floats | None = None) -> Floats:
+    """Least-squares rigid transform without scale (Kabsch; Umeyama 1991, doi:10.1109/34.88573).
+
+    Args:
+        source, target: (n, 3) corresponding points, metres, n >= 3 and not on a line.
+        weight: (n,) non-negative weights; equal if None.
+
+    Returns:
+        4x4 transform from source to target; the rotation is proper (determinant +1).
+
+    """
+    w = np.ones(len(source)) if weight is None else np.asarray(weight, np.float64)
+    w = w / w.sum()
+    cs, ct = w @ source, w @ target
+    U, _, Vt = np.linalg.svd((target - ct).T @ ((source - cs) * w[:, None]))
+    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return geometry.compose(R, ct - R @ cs)
+
+
+def fit_upright(source: Floats, target: Floats, weight: Floats | None = None) -> Floats:
+    """Least-squares yaw and shift, with the vertical known.
+
+    Args:
+        source, target: (n, 3) or (n, 2) corresponding points, metres, n >= 2.
+        weight: (n,) non-negative weights; equal if None.
+
+    Returns:
+        4x4 transform; its vertical shift is the mean height difference, 0 for planar input.
+
+    """
+    w = np.ones(len(source)) if weight is None else np.asarray(weight, np.float64)
+    w = w / w.sum()
+    cs, ct = w @ source, w @ target
+    a, b = source - cs, target - ct
+    cross = float(w @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
+    dot = float(w @ (a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]))
+    R = geometry.yaw_matrix(np.arctan2(cross, dot))
+    if source.shape[1] == 2:
+        cs, ct = np.append(cs, 0.0), np.append(ct, 0.0)
+    return geometry.compose(R, ct - R @ cs)
+
+
+def ransac_upright(
+    source: Floats, target: Floats, tolerance: float, seed: int, iterations: int = 2000
+) -> tuple[Floats, Mask]:
+    """Find the yaw and shift on which most ties agree in plan.
+
+    Args:
+        source, target: (n, >=2) corresponding points, metres.
+        tolerance: largest plan residual of an inlier, metres.
+        seed: of the sampling.
+        iterations: pairs of ties tried.
+
+    Returns:
+        4x4 transform refitted to its inliers (planar: no vertical part), and the (n,) inlier mask.
+        With fewer than two ties, the identity and an empty mask.
+
+    """
+    n = len(source)
+    s, t = np.asarray(source[:, :2]), np.asarray(target[:, :2])
+    if n < 2:
+        return np.eye(4), np.zeros(n, bool)
+    rng = np.random.default_rng(seed)
+    first = rng.integers(0, n, iterations)
+    second = (first + rng.integers(1, n, iterations)) % n
+    ds, dt = s[second] - s[first], t[second] - t[first]
+    ls, lt = np.hypot(*ds.T), np.hypot(*dt.T)
+    # a rigid motion keeps distances; short bases turn noise into yaw
+    usable = (np.abs(ls - lt) < 2 * tolerance) & (ls > 4 * tolerance)
+    first, ds, dt = first[usable], ds[usable], dt[usable]
+    if not len(first):
+        return np.eye(4), np.zeros(n, bool)
+    yaw = np.arctan2(ds[:, 0] * dt[:, 1] - ds[:, 1] * dt[:, 0], (ds * dt).sum(axis=1))
+    best, best_count = np.zeros(n, bool), -1
+    for angle, i in zip(yaw, first, strict=True):
+        c, r = np.cos(angle), np.sin(angle)
+        moved = (s - s[i]) @ np.array([[c, r], [-r, c]]) + t[i]
+        inlier = ((moved - t) ** 2).sum(axis=1) < tolerance**2
+        count = int(inlier.sum())
+        if count > best_count:
+            best, best_count = inlier, count
+    T = fit_upright(s[best], t[best])
+    for _ in range(5):
+        residual = np.hypot(*(geometry.apply(T, _planar(s))[:, :2] - t).T)
+        inlier = residual < tolerance
+        if inlier.sum() < 2 or (inlier == best).all():
+            break
+        best = inlier
+        T = fit_upright(s[best], t[best])
+    return T, best
+
+
+def _planar(xy: Floats) -> Floats:
+    return np.column_stack([xy, np.zeros(len(xy))])
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Result of the iterative SVD.
+
+    Attributes:
+        T: 4x4 from source to target.
+        inlier: (n,) ties within the final threshold.
+        iterations: rounds until nothing changed.
+        threshold: final residual threshold, metres.
+
+    """
+
+    T: Floats
+    inlier: Mask
+    iterations: int
+    threshold: float
+
+
+def iterative_svd(
+    source: Floats,
+    target: Floats,
+    *,
+    start: Mask | None = None,
+    weight: Floats | None = None,
+    factor: float = 2.5,
+    floor: float = 0.5,
+    max_iterations: int = 30,
+    upright: bool = False,
+) -> Solution:
+    """Fit, drop what lies beyond ``factor`` robust standard deviations, and repeat until stable.
+
+    Args:
+        source, target: (n, 3) ties, metres.
+        start: (n,) ties of the first fit; all if None (as in the paper).
+        weight: (n,) weights.
+        factor: residuals beyond this many times 1.4826 median residuals are outliers.
+        floor: the threshold never falls below this, metres: below the raster's own precision a residual
+            says nothing.
+        max_iterations: rounds at most.
+        upright: solve yaw and shift only.
+
+    """
+    fit = fit_upright if upright else fit_rigid
+    least = 2 if upright else 3
+    inlier = np.ones(len(source), bool) if start is None else start.copy()
+    T, threshold, rounds = np.eye(4), floor, 0
+    for rounds in range(1, max_iterations + 1):  # noqa: B007 - reported below
+        T = fit(source[inlier], target[inlier], None if weight is None else weight[inlier])
+        residual = np.linalg.norm(geometry.apply(T, source) - target, axis=1)
+        threshold = max(floor, factor * 1.4826 * float(np.median(residual[inlier])))
+        now = residual < threshold
+        if now.sum() < least or (now == inlier).all():
+            break
+        inlier = now
+    return Solution(T, inlier, rounds, threshold)
