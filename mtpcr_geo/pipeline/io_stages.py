@@ -75,17 +75,14 @@ class LasReader(Stage):
     def _open(self) -> Cloud:
         from mtpcr_geo.cloud.las import open_cloud
 
-        override = self._crs("override_srs", self.options.override_srs)
-        default = self._crs("default_srs", self.options.default_srs)
+        override = stated_crs(self, "override_srs", self.options.override_srs)
+        default = stated_crs(self, "default_srs", self.options.default_srs)
         cloud: Cloud = open_cloud(self.options.filename, override)
         if cloud.crs is None and default is not None:
             cloud = open_cloud(self.options.filename, default)
         if self.options.count is not None and self.options.count < cloud.count:
             cloud = Head(cloud, self.options.count)
         return cloud
-
-    def _crs(self, option: str, text: str | None) -> CRS | None:
-        return parse_crs(text, f"{self.label}: option {option!r}") if text else None
 
 
 class CopcReaderOptions(LasReaderOptions):
@@ -165,19 +162,14 @@ class LasWriter(Stage):
 
     def check(self, context: RunContext) -> None:
         """Read the CRS option."""
-        if self.options.a_srs:
-            parse_crs(self.options.a_srs, f"{self.label}: option 'a_srs'")
+        stated_crs(self, "a_srs", self.options.a_srs)
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Stream the cloud to the file, and hand it on."""
         from mtpcr_geo.cloud.write import write_cloud
 
         cloud = one_cloud(self, inputs)
-        crs = (
-            parse_crs(self.options.a_srs, f"{self.label}: option 'a_srs'")
-            if self.options.a_srs
-            else cloud.crs
-        )
+        crs = stated_crs(self, "a_srs", self.options.a_srs) or cloud.crs
         path = context.outputs.path(self.options.filename)
         if isinstance(cloud, Moved):
             write_cloud(path, cloud.base, cloud.move, crs)
@@ -212,19 +204,18 @@ def one_cloud(stage: Stage, inputs: Sequence[Value]) -> Cloud:
     )
 
 
-def parse_crs(text: str, where: str) -> CRS:
-    """Read what a user wrote as a coordinate reference system.
+def stated_crs(stage: Stage, option: str, text: str | None) -> CRS | None:
+    """Read a CRS option of a stage; None where it is not given.
 
     Raises:
-        CrsError: if PROJ knows no such system.
+        CrsError: naming the stage and the option.
 
     """
-    from pyproj import CRS
-    from pyproj.exceptions import CRSError
+    from mtpcr_geo.crs import parse_crs
 
+    if text is None:
+        return None
     try:
-        return CRS.from_user_input(text)
-    except CRSError as error:
-        raise CrsError(
-            f"{where}: {text!r} is no coordinate reference system that PROJ knows; write it like EPSG:2154"
-        ) from error
+        return parse_crs(text)
+    except CrsError as error:
+        raise CrsError(f"{stage.label}: option {option!r}: {error}") from error

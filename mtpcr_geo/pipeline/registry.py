@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from mtpcr_geo.errors import OptionError
 from mtpcr_geo.pipeline.stage import Stage, StageOptions
@@ -50,10 +50,11 @@ def make_options(label: str, model: type[StageOptions], words: Mapping[str, Any]
     try:
         return model.model_validate(words)
     except ValidationError as error:
-        raise OptionError(f"{label}: {_first(error, model)}") from None
+        raise OptionError(f"{label}: {first_problem(error, model)}") from None
 
 
-def _first(error: ValidationError, model: type[StageOptions]) -> str:
+def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
+    """Put what is wrong with options in one line: the first thing, with the nearest valid word."""
     # a misspelt key often causes a missing one too, and says more
     problems = sorted(
         error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden"

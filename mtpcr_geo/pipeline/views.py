@@ -75,6 +75,13 @@ class View(Cloud):
             if keep.any():
                 yield {name: values[keep] for name, values in table.items()}
 
+    def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, NDArray[np.bool_]]]:
+        """Yield coordinates (n, 3) and which of them are noise or withheld (n,), n <= size."""
+        chunks = (((xyz, noise), xyz) for xyz, noise in self.base.noise_chunks(size))
+        for (xyz, noise), keep in self._masked(chunks):
+            if keep.any():
+                yield xyz[keep], noise[keep]
+
     def _masked(self, chunks: Iterable[tuple[Any, Floats]]) -> Iterator[tuple[Any, NDArray[np.bool_]]]:
         raise NotImplementedError
 

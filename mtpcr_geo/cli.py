@@ -1,0 +1,211 @@
+"""The command: one thin function a verb. Everything heavy is imported where it is used."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+import mtpcr_geo
+from mtpcr_geo.errors import EXIT_DOUBTFUL, EXIT_REFUSED, MtpcrError
+
+if TYPE_CHECKING:
+    from mtpcr_geo.pipeline.stage import Progress
+    from mtpcr_geo.register import Registration
+
+EXIT_BY_VERDICT = {"accepted": 0, "doubtful": EXIT_DOUBTFUL, "refused": EXIT_REFUSED}
+EXIT_INTERRUPTED = 130
+
+
+class _Group(TyperGroup):
+    """Turns whatever a user can cause into one line on standard error and an exit code."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except MtpcrError as error:
+            typer.echo(f"mtpcr-geo: error: {' '.join(str(error).split())}", err=True)
+            raise typer.Exit(error.exit_code) from None
+        except KeyboardInterrupt:
+            typer.echo("mtpcr-geo: interrupted; nothing was written", err=True)
+            raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+app = typer.Typer(
+    name="mtpcr-geo",
+    cls=_Group,
+    help="Register ground and aerial lidar clouds through bird's-eye-view height images.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+class Level(StrEnum):
+    """How to make clouds upright."""
+
+    auto = "auto"
+    ransac = "ransac"
+    none = "none"
+
+
+Verbose = Annotated[
+    bool, typer.Option("--verbose", "-v", help="Say what every stage did and how long it took.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the run as JSON on standard output.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that are already there.")]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"mtpcr-geo {mtpcr_geo.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def register(
+    source: Annotated[Path, typer.Argument(help="Cloud that moves: LAS, LAZ or COPC.", show_default=False)],
+    target: Annotated[Path, typer.Argument(help="Cloud that stays: LAS, LAZ or COPC.", show_default=False)],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for the result and its evidence.", show_default=False)
+    ],
+    source_crs: Annotated[
+        str | None,
+        typer.Option(help="CRS of the source, instead of what its file states; such as EPSG:2154."),
+    ] = None,
+    target_crs: Annotated[
+        str | None, typer.Option(help="CRS of the target, instead of what its file states.")
+    ] = None,
+    local: Annotated[bool, typer.Option("--local", help="Both clouds are local, in metres.")] = False,
+    level: Annotated[Level, typer.Option(help="How to make the clouds upright.")] = Level.auto,
+    cell: Annotated[
+        float | None, typer.Option(help="Cell of the height rasters in metres; chosen if not given.")
+    ] = None,
+    no_prior: Annotated[
+        bool, typer.Option("--no-prior", help="Do not use the clouds' shared georeference (the default).")
+    ] = True,
+    profile: Annotated[str, typer.Option(help="Which set of steps and settings to run.")] = "default",
+    seed: Annotated[int, typer.Option(help="Seed of everything random.")] = 0,
+    overwrite: Overwrite = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Write the registered cloud though the verdict refuses it.")
+    ] = False,
+    no_recording: Annotated[bool, typer.Option("--no-recording", help="Keep no recording.")] = False,
+    dump_pipeline: Annotated[
+        bool, typer.Option("--dump-pipeline", help="Print the run as pipeline JSON, and do not run it.")
+    ] = False,
+    as_json: AsJson = False,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Bring SOURCE to TARGET; write the registered cloud, its transform and the evidence to a folder.
+
+    Exit code 0: accepted; 3: doubtful; 4: refused (evidence only); others: see the manual.
+    """
+    from mtpcr_geo.pipeline.grammar import dump
+    from mtpcr_geo.register import build_pipeline, read_options
+    from mtpcr_geo.register import register as run
+
+    words = {
+        "source_crs": source_crs, "target_crs": target_crs, "local": local, "level": level.value, "cell": cell,
+        "profile": profile, "prior": not no_prior, "seed": seed, "recording": not no_recording, "force": force,
+        "overwrite": overwrite,
+    }  # fmt: skip
+    if dump_pipeline:
+        typer.echo(dump(build_pipeline(source, target, out, read_options(words))))
+        return
+    with _progress(quiet) as progress:
+        result = run(source, target, out, progress=progress, **words)
+    _report(result, as_json=as_json, verbose=verbose, quiet=quiet)
+    raise typer.Exit(EXIT_BY_VERDICT[result.verdict.name])
+
+
+@app.command()
+def apply(
+    transform: Annotated[Path, typer.Argument(help="A transform.json of a run.", show_default=False)],
+    cloud: Annotated[Path, typer.Argument(help="Cloud to move: LAS, LAZ or COPC.", show_default=False)],
+    out: Annotated[Path, typer.Argument(help="File to write: .las or .laz.", show_default=False)],
+    inverse: Annotated[bool, typer.Option("--inverse", help="From target to source instead.")] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Stream any cloud through the transform of a run."""
+    from mtpcr_geo.cloud.apply import apply_transform
+
+    apply_transform(transform, cloud, out, inverse=inverse, overwrite=overwrite)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the demo's files.")] = Path(
+        "mtpcr-demo"
+    ),
+    seed: Annotated[int, typer.Option(help="Seed of the simulated town.")] = 0,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate a town, scan it from a street and from the air, register the two, and compare with the truth."""
+    from mtpcr_geo.demo import run_demo
+
+    with _progress(quiet) as progress:
+        result = run_demo(out, seed=seed, overwrite=overwrite, progress=progress)
+    _report(result.registration, as_json=False, verbose=False, quiet=quiet)
+    if not quiet:
+        typer.echo(result.summary)
+    raise typer.Exit(EXIT_BY_VERDICT[result.registration.verdict.name])
+
+
+def main() -> None:
+    """Run the command."""
+    signal.signal(signal.SIGTERM, _interrupt)
+    app()
+
+
+def _interrupt(signum: int, frame: object) -> None:
+    # a kill must leave as little behind as Ctrl-C does
+    raise KeyboardInterrupt
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Progress]:
+    from mtpcr_geo.progress import NoProgress, RichProgress
+
+    if quiet or not sys.stderr.isatty():
+        yield NoProgress()
+        return
+    from rich.console import Console
+
+    with RichProgress(Console(stderr=True)) as bars:
+        yield bars
+
+
+def _report(result: Registration, *, as_json: bool, verbose: bool, quiet: bool) -> None:
+    if as_json:
+        typer.echo(result.outputs["run"].read_text(encoding="utf-8"), nl=False)
+    elif not quiet:
+        from rich.console import Console
+
+        from mtpcr_geo.summary import print_registration
+
+        print_registration(Console(highlight=False), result, verbose=verbose)
+
+
+if __name__ == "__main__":
+    main()

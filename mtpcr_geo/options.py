@@ -1,0 +1,45 @@
+"""The options of a whole registration: what the command and `register` take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class RegisterOptions(BaseModel):
+    """Options of a registration; the same words as on the command line."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    source_crs: str | None = Field(None, description="CRS of the source, instead of what its file states")
+    target_crs: str | None = Field(None, description="CRS of the target, instead of what its file states")
+    local: bool = Field(False, description="both clouds are local, in metres, whatever their files state")
+    level: Literal["auto", "ransac", "none"] = Field(
+        "auto", description="how to make the clouds upright; auto trusts georeferenced clouds"
+    )
+    cell: float | None = Field(
+        None, gt=0, allow_inf_nan=False, description="cell of the height rasters, metres; chosen if not given"
+    )
+    prior: Literal[False] = Field(
+        False, description="use the clouds' shared georeference as a start; not offered yet"
+    )
+    profile: Literal["default"] = Field("default", description="which set of steps and settings to run")
+    seed: int = Field(0, ge=0, description="seed of everything random")
+    recording: bool = Field(True, description="keep a recording of the run for the rerun viewer")
+    force: bool = Field(False, description="write the registered cloud though the verdict refuses it")
+    overwrite: bool = Field(False, description="replace files that are already there")
+
+
+OUTPUT_NAMES = {
+    "bev": Path("bev") / "#.tif",
+    "ties": Path("ties.gpkg"),
+    "transform": Path("transform.json"),
+    "matrix": Path("transform.cloudcompare.txt"),
+    "pdal": Path("transform.pdal.json"),
+    "recording": Path("audit.rrd"),
+    "registered": Path("registered.laz"),
+    "report": Path("report.html"),
+    "run": Path("run.json"),
+}

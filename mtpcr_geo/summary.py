@@ -1,0 +1,85 @@
+"""What a run came to, in a few lines for a terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mtpcr_geo import geometry
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from mtpcr_geo.register import Registration
+
+_COLOUR = {"accepted": "bold green", "doubtful": "bold yellow", "refused": "bold red"}
+_OPEN_WITH = {
+    "registered": "the moved cloud",
+    "report": "the report, in any browser",
+    "recording": "the recording, with: rerun",
+    "ties": "ties and footprints, in QGIS",
+    "run": "everything as numbers",
+}
+
+
+def print_registration(console: Console, result: Registration, *, verbose: bool = False) -> None:
+    """Print verdict, reasons, the transform in words, the checks, and which files to open."""
+    from rich.table import Table
+    from rich.text import Text
+
+    name = result.verdict.name
+    console.print(Text(name.upper(), _COLOUR[name]))
+    for reason in result.verdict.reasons:
+        console.print(Text(f"  {reason}"), soft_wrap=True)
+    facts = Table(box=None, show_header=False, pad_edge=True, padding=(0, 1))
+    for label, value in (*_transform_rows(result), *_metric_rows(result.verdict.metrics)):
+        facts.add_row(label, value)
+    if facts.row_count:
+        console.print(facts)
+    if verbose:
+        _print_stages(console, result)
+    for what, path in result.outputs.items():
+        if what in _OPEN_WITH:
+            console.print(Text(f"  {path}"), Text(_OPEN_WITH[what], "dim"), soft_wrap=True)
+    if name == "refused" and "registered" not in result.outputs:
+        console.print(Text("  no registered cloud was written; --force writes it all the same", "dim"))
+
+
+def _transform_rows(result: Registration) -> list[tuple[str, str]]:
+    pair = result.pair
+    if pair is None or pair.T_target_source is None or result.T_target_source is None:
+        return []
+    T = result.T_target_source
+    middle = (pair.source.cloud.minimum + pair.source.cloud.maximum) / 2
+    moved = pair.target.link.to_file(
+        geometry.apply(pair.T_target_source, pair.source.link.to_work(middle[np.newaxis]))
+    )[0]
+    shift = moved - middle
+    yaw = math.degrees(geometry.yaw_of(T[:3, :3]))
+    upright = geometry.yaw_matrix(geometry.yaw_of(T[:3, :3]))
+    tilt = math.degrees(geometry.rotation_angle(upright.T @ T[:3, :3]))
+    return [
+        ("yaw", f"{yaw:+.3f} degrees, tilt {tilt:.3f}"),
+        ("shift of the middle", f"{shift[0]:+.2f}, {shift[1]:+.2f}, {shift[2]:+.2f} (x, y, z)"),
+    ]
+
+
+def _metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    return [(key.replace("_", " "), _number(value)) for key, value in metrics.items() if _is_plain(value)]
+
+
+def _is_plain(value: Any) -> bool:
+    return isinstance(value, int | float | str) and not isinstance(value, bool)
+
+
+def _number(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _print_stages(console: Console, result: Registration) -> None:
+    for entry in result.report:
+        note = entry.get("skipped") or entry.get("failed") or ""
+        console.print(f"  {entry['seconds']:8.2f} s  {entry['tag']} ({entry['type']}) {note}", soft_wrap=True)
