@@ -89,7 +89,7 @@ def read_records(
 
 
 def _text(raw: bytes) -> str:
-    return raw.split(b"\0")[0].decode("ascii", errors="replace")
+    return raw.split(b"\0")[0].decode("ascii", errors="ignore")
 
 
 def crs_of_records(records: Sequence[Record]) -> tuple[CRS | None, str]:
