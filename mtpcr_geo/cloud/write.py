@@ -27,6 +27,7 @@ Floats = NDArray[np.float64]
 Move = Callable[[Floats], Floats]
 STEP, FINEST_STEP = 0.001, 0.0001  # metres or feet
 DEGREE_STEP = 1e-9  # a tenth of a millimetre, and 32 bits still span four degrees
+_METRES_A_DEGREE = 1e5
 _INT32 = 2**31 - 1
 
 
@@ -94,6 +95,27 @@ def is_copc(path: Path) -> bool:
     return suffixes[-1:] == [".laz"] and ".copc" in suffixes
 
 
+def returning_scales(cloud: Cloud, crs: CRS | None) -> Floats:
+    """Choose scales (3,) fine enough that a cloud can be moved, written, and moved back onto its own digits.
+
+    A rotation puts up to 1.4 steps of error on a coordinate by there and back, so the step is a tenth of
+    the input's, within 0.00001 and 0.001 metres (or feet), as long as the cloud's extent allows it.
+    """
+    scales = np.full(3, STEP)
+    if isinstance(cloud, LasCloud):
+        scales = np.asarray(cloud.header.scales, np.float64) / 10
+        if cloud.crs is not None and cloud.crs.is_geographic:
+            scales[:2] *= _METRES_A_DEGREE
+        scales = np.clip(scales, FINEST_STEP / 10, STEP)
+    extent = cloud.maximum - cloud.minimum
+    if cloud.crs is None or not cloud.crs.is_geographic:
+        while np.isfinite(extent).all() and scales.min() < STEP and extent.max() / scales.min() > _INT32:
+            scales = np.minimum(scales * 10, STEP)
+    if crs is not None and crs.is_geographic:
+        scales[:2] = np.minimum(scales[:2] / _METRES_A_DEGREE, DEGREE_STEP)
+    return scales
+
+
 def _write_las(path: Path, header: laspy.LasHeader, chunks: Iterator[NDArray[Any]]) -> None:
     # the first chunk settles the offsets, which the header needs before anything is written
     first = next(chunks, None)
@@ -138,7 +160,7 @@ def _placed(
         if not worst <= _INT32:
             reach = float(np.abs(moved - header.offsets).max())
             raise OutputError(
-                f"a point {reach:.0f} away from the others does not fit a LAS file at scale {scales.min():g}; "
+                f"a point {reach:.0f} from the others does not fit a LAS file at scale {scales.min():g}; "
                 "give a coarser scale, or remove stray points"
             )
         for axis, name in enumerate("XYZ"):
