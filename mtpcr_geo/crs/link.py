@@ -134,9 +134,9 @@ def run_pipeline(pipeline: str, xyz: Floats, inverse: bool = False) -> Floats:
     from pyproj.exceptions import ProjError
 
     direction = TransformDirection.INVERSE if inverse else TransformDirection.FORWARD
-    columns = [np.array(xyz[:, axis], np.float64) for axis in range(3)]
+    x, y, z = (np.array(xyz[:, axis], np.float64) for axis in range(3))
     try:
-        moved = _transformer(pipeline).transform(*columns, direction=direction, errcheck=False)
+        moved = _transformer(pipeline).transform(x, y, z, direction=direction, errcheck=False)
     except ProjError as error:
         raise CrsError(f"PROJ cannot run the pipeline {pipeline!r}: {error}") from error
     result = np.column_stack(moved)
@@ -144,8 +144,8 @@ def run_pipeline(pipeline: str, xyz: Floats, inverse: bool = False) -> Floats:
     if bad.any():
         place = ", ".join(f"{value:.6f}" for value in xyz[int(bad.argmax())])
         raise CrsError(
-            f"{int(bad.sum())} points lie outside the area of the coordinate operation, the first at ({place}); "
-            "check the CRS against the coordinates"
+            f"{int(bad.sum())} points lie outside the area of the coordinate operation, the first at "
+            f"({place}); check the CRS against the coordinates"
         )
     return result
 

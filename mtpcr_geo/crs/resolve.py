@@ -113,11 +113,16 @@ def _require_projected_metric(cloud: Cloud, crs: CRS) -> None:
         raise CrsError(f"{cloud.name} is in {crs.name} with units {names}; reproject it to metres first")
 
 
+def same_place(one: CRS, other: CRS) -> bool:
+    """Tell whether the same coordinates mean the same place in two CRSs, however their WKT is written."""
+    if one.equals(other, ignore_axis_order=True):
+        return True
+    code = one.to_epsg()
+    return code is not None and code == other.to_epsg()
+
+
 def _require_same(target: CRS, source: CRS) -> None:
-    if target.equals(source, ignore_axis_order=True):
-        return
-    code = target.to_epsg()
-    if code is None or code != source.to_epsg():
+    if not same_place(target, source):
         raise CrsError(
             f"the target is in {target.name} and the source in {source.name}; reproject one of them first, "
             "or say with --target-crs or --source-crs what they are"

@@ -1,0 +1,105 @@
+"""The whole way of a point: source file, work frame, rigid transform, work frame, target file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo import geometry
+from mtpcr_geo.crs.link import FrameLink, fit_affine
+
+if TYPE_CHECKING:
+    from mtpcr_geo.scene import Pair
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TransformChain:
+    """A registration's result, ready to move points either way without losing digits far from the origin.
+
+    Attributes:
+        source: between source file coordinates and source work coordinates.
+        target: between target file coordinates and target work coordinates.
+        T_target_source: 4x4 rigid transform in work coordinates, metres.
+        pivot: (3,) centroid of the source, in source file coordinates.
+        bounds: (2, 3) of the source, in source file coordinates.
+
+    """
+
+    source: FrameLink
+    target: FrameLink
+    T_target_source: Floats
+    pivot: Floats
+    bounds: Floats
+
+    @classmethod
+    def of(cls, pair: Pair) -> TransformChain:
+        """Take the chain of a solved pair.
+
+        Raises:
+            ValueError: if the pair has no transform yet.
+
+        """
+        if pair.T_target_source is None:
+            raise ValueError("the pair has no transform yet")
+        link, cloud = pair.source.link, pair.source.cloud
+        sample = pair.source.sample
+        centre = sample.mean(axis=0) if len(sample) else np.zeros(3)
+        return cls(
+            source=link,
+            target=pair.target.link,
+            T_target_source=np.asarray(pair.T_target_source, np.float64),
+            pivot=link.to_file(centre[None])[0],
+            bounds=np.stack([cloud.minimum, cloud.maximum]).astype(np.float64),
+        )
+
+    def forward(self, xyz: Floats) -> Floats:
+        """Take (n, 3) source file coordinates to (n, 3) target file coordinates."""
+        return self.target.to_file(geometry.apply(self.T_target_source, self.source.to_work(xyz)))
+
+    def inverse(self, xyz: Floats) -> Floats:
+        """Take (n, 3) target file coordinates to (n, 3) source file coordinates."""
+        return self.source.to_file(geometry.apply(self.T_source_target, self.target.to_work(xyz)))
+
+    @property
+    def T_source_target(self) -> Floats:
+        """4x4 in work coordinates, metres, from target to source."""
+        return geometry.inverse(self.T_target_source)
+
+    @property
+    def is_affine(self) -> bool:
+        """Whether one 4x4 on file coordinates says the same as the chain."""
+        return self.source.pipeline is None and self.target.pipeline is None
+
+    @property
+    def T_file(self) -> Floats:
+        """4x4 from source to target file coordinates; the best fit within the bounds if not affine."""
+        if self.is_affine:
+            return self.target.T_file_work @ self.T_target_source @ self.source.T_work_file
+        return fit_affine(self.forward, self.bounds)[0]
+
+    @property
+    def departure(self) -> float:
+        """How far in metres the 4x4 is from the chain, at most, within the source's bounds; 0 if affine."""
+        if self.is_affine:
+            return 0.0
+        T = self.T_file
+        corners = box_points(self.bounds)
+        chained = self.target.to_work(self.forward(corners))
+        direct = self.target.to_work(geometry.apply(T, corners))
+        return float(np.linalg.norm(chained - direct, axis=1).max())
+
+    @property
+    def rotation_in_files(self) -> Floats:
+        """(3, 3) linear part of the 4x4, which turns about `pivot` without any far origin in the sums."""
+        return self.T_file[:3, :3]
+
+
+def box_points(bounds: Floats, steps: int = 5) -> Floats:
+    """Give a grid of points over a box, (steps**3, 3), its corners among them."""
+    axes = [np.linspace(low, high, steps) for low, high in np.asarray(bounds).T]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

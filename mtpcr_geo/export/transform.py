@@ -1,0 +1,319 @@
+"""Transforms as files that say which frame they are in, at full precision."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo import geometry
+from mtpcr_geo.crs.chain import TransformChain
+from mtpcr_geo.crs.link import FrameLink
+from mtpcr_geo.errors import InputError
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+    from mtpcr_geo.scene import Pair
+
+Floats = NDArray[np.float64]
+KIND, VERSION = "mtpcr-geo transform", 1
+_SHARED_SHIFT = 10_000.0  # beyond this, single precision would show in one common shift
+_EARTH_RADIUS = 6_371_000.0
+
+
+def write_transform_json(path: str | Path, pair: Pair) -> None:
+    """Write ``transform.json``: the transform in every form, and all that applying it needs.
+
+    ``T_target_source`` acts on coordinates as they stand in the files. Where no 4x4 can do that exactly
+    (a map projection lies between), it is the best fit, and ``exactness`` says by how much it is off;
+    ``chain`` is exact always.
+    """
+    chain = TransformChain.of(pair)
+    work = pair.frame.crs
+    T = chain.T_file
+    example = _example(pair, chain)
+    moved = chain.forward(example[None])[0]
+    document: dict[str, Any] = {
+        "type": KIND,
+        "version": VERSION,
+        "T_target_source": T,
+        "T_source_target": np.linalg.inv(T) if not _is_rigid(T) else geometry.inverse(T),
+        "frame": "coordinates as they stand in the files: T takes those of the source to the target's",
+        "exactness": {
+            "exact": chain.is_affine,
+            "departure_m": chain.departure,
+            "note": "T_target_source says the same as the chain"
+            if chain.is_affine
+            else "T_target_source is the best fit within the source's bounds; the chain is exact",
+        },
+        "units": {"source": _units(chain.source), "target": _units(chain.target)},
+        "pivot": {
+            "source": chain.pivot,
+            "target": chain.forward(chain.pivot[None])[0],
+            "linear": T[:3, :3],
+            "note": "target = linear (x - source pivot) + target pivot loses no digits far from the origin",
+        },
+        "motion": _motion(chain),
+        "work": {
+            "crs": _crs(work),
+            "units": "metre",
+            "frame": "each side's file coordinates through its chain, less its origin",
+            "source_origin": chain.source.origin,
+            "target_origin": chain.target.origin,
+            "T_target_source": chain.T_target_source,
+            "T_source_target": chain.T_source_target,
+        },
+        "chain": {
+            "source": _link(chain.source),
+            "target": _link(chain.target),
+            "source_bounds": chain.bounds,
+        },
+        "example": {
+            "source": example,
+            "target": moved,
+            "source_again": chain.inverse(moved[None])[0],
+            "by_matrix": geometry.apply(T, example[None])[0],
+        },
+        "cloudcompare": {key: value for key, value in _cloudcompare(chain).items() if key != "matrix"},
+        "files": {"source": Path(pair.source.cloud.name).name, "target": Path(pair.target.cloud.name).name},
+    }
+    Path(path).write_text(dumps(document) + "\n", encoding="utf-8")
+
+
+def write_cloudcompare_matrix(path: str | Path, pair: Pair) -> None:
+    """Write the 4x4 for CloudCompare: four rows of four numbers, and nothing else.
+
+    CloudCompare holds points in single precision, less a global shift. The matrix acts on points loaded
+    with the shifts that ``transform.json`` names under ``cloudcompare``.
+    """
+    rows = _cloudcompare(TransformChain.of(pair))["matrix"]
+    text = "\n".join(" ".join(f"{value:.17g}" for value in row) for row in rows)
+    Path(path).write_text(text + "\n", encoding="utf-8")
+
+
+def write_pdal_pipeline(path: str | Path, pair: Pair) -> None:
+    """Write a PDAL pipeline that moves the source file as the chain does, and writes LAS 1.4."""
+    chain = TransformChain.of(pair)
+    source_name = pair.source.cloud.name
+    stages: list[Any] = [source_name]
+    if chain.is_affine:
+        stages.append({"type": "filters.transformation", "matrix": _row_major(chain.T_file)})
+    else:
+        inner = geometry.translation(chain.target.origin) @ chain.T_target_source
+        stages += _pdal_link(chain.source, inverse=False)
+        stages.append(
+            {
+                "type": "filters.transformation",
+                "matrix": _row_major(inner @ geometry.translation(-chain.source.origin)),
+            }
+        )
+        stages += _pdal_link(chain.target, inverse=True)
+    writer: dict[str, Any] = {
+        "type": "writers.las",
+        "filename": f"{Path(source_name).stem}_registered.laz",
+        "minor_version": 4,
+        "forward": "vlr,gps_time,global_encoding",
+        "extra_dims": "all",
+        "offset_x": "auto",
+        "offset_y": "auto",
+        "offset_z": "auto",
+        "compression": True,
+    }
+    step = 1e-9 if chain.target.file_crs is not None and chain.target.file_crs.is_geographic else 0.001
+    writer |= {"scale_x": step, "scale_y": step, "scale_z": 0.001}
+    if chain.target.file_crs is not None:
+        writer["a_srs"] = chain.target.file_crs.to_wkt()
+    stages.append(writer)
+    Path(path).write_text(dumps({"pipeline": stages}) + "\n", encoding="utf-8")
+
+
+def read_transform(path: str | Path) -> TransformChain:
+    """Read a ``transform.json``.
+
+    Raises:
+        InputError: if it is missing, or not such a file.
+
+    """
+    path = Path(path)
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}; name a transform.json") from error
+    except ValueError as error:
+        raise InputError(f"{path} is not JSON ({error}); name a transform.json") from error
+    if not isinstance(document, dict) or document.get("type") != KIND:
+        raise InputError(f"{path} is not a transform that this program wrote; name a transform.json")
+    if document.get("version") != VERSION:
+        raise InputError(
+            f"{path} is a transform of version {document.get('version')}, and this program reads {VERSION}; "
+            "update it, or register again"
+        )
+    try:
+        chain = document["chain"]
+        result = TransformChain(
+            source=_read_link(chain["source"]),
+            target=_read_link(chain["target"]),
+            T_target_source=_array(document["work"]["T_target_source"], (4, 4)),
+            pivot=_array(document["pivot"]["source"], (3,)),
+            bounds=_array(chain["source_bounds"], (2, 3)),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path} is damaged ({type(error).__name__}: {error}); register again to write a new one"
+        ) from error
+    return result
+
+
+def dumps(value: Any, indent: int = 0) -> str:
+    """Write JSON with 17 significant digits, and the rows of a matrix in a line each."""
+    pad = "  " * (indent + 1)
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        if not value:
+            return "{}"
+        items = [f"{pad}{json.dumps(str(key))}: {dumps(item, indent + 1)}" for key, item in value.items()]
+        return "{\n" + ",\n".join(items) + "\n" + "  " * indent + "}"
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        if all(item is None or isinstance(item, str | int | float) for item in value):
+            return "[" + ", ".join(dumps(item) for item in value) + "]"
+        return (
+            "[\n" + ",\n".join(pad + dumps(item, indent + 1) for item in value) + "\n" + "  " * indent + "]"
+        )
+    if isinstance(value, float):
+        if not np.isfinite(value):
+            return "null"
+        text = f"{value:.17g}"
+        # a number that looks like an integer would be read back as one
+        return text if any(mark in text for mark in ".e") else text + ".0"
+    return json.dumps(value)
+
+
+def _is_rigid(T: Floats) -> bool:
+    return bool(np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), rtol=0, atol=1e-12))
+
+
+def _example(pair: Pair, chain: TransformChain) -> Floats:
+    """Give one point of the source, in file coordinates, as the worked example."""
+    sample = pair.source.sample
+    return chain.source.to_file(sample[:1])[0] if len(sample) else chain.pivot
+
+
+def _motion(chain: TransformChain) -> dict[str, Any]:
+    R = chain.T_target_source[:3, :3]
+    return {
+        "rotation_deg": float(np.degrees(geometry.rotation_angle(R))),
+        "yaw_deg": float(np.degrees(geometry.yaw_of(R))),
+        "tilt_deg": float(np.degrees(np.arctan2(np.hypot(R[0, 2], R[1, 2]), R[2, 2]))),
+        "note": "in the work frame; yaw counter-clockwise seen from above",
+    }
+
+
+def _units(link: FrameLink) -> list[str]:
+    if link.file_crs is None:
+        return ["metre"] * 3
+    names = [axis.unit_name for axis in link.file_crs.axis_info]
+    if len(names) < 3:
+        names.append("metre" if link.factor[2] == 1.0 else f"{link.factor[2]:.17g} metre")
+    return names[:3]
+
+
+def _crs(crs: CRS | None) -> dict[str, Any] | None:
+    if crs is None:
+        return None
+    authority = crs.to_authority()
+    return {
+        "name": crs.name,
+        "authority": ":".join(authority) if authority else None,
+        "wkt": crs.to_wkt("WKT2_2019"),
+    }
+
+
+def _link(link: FrameLink) -> dict[str, Any]:
+    return {
+        "crs": _crs(link.file_crs),
+        "steps": "work = factor * pipeline(file) - origin, element by element; no pipeline means file itself",
+        "pipeline": link.pipeline,
+        "factor": link.factor,
+        "origin": link.origin,
+        "bounds": link.bounds,
+        "report": link.report,
+    }
+
+
+def _read_link(data: Mapping[str, Any]) -> FrameLink:
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    crs = None
+    if data["crs"] is not None:
+        try:
+            crs = CRS.from_wkt(data["crs"]["wkt"])
+        except CRSError as error:
+            raise ValueError(f"its CRS cannot be read ({error})") from error
+    pipeline = data["pipeline"]
+    if pipeline is not None and not isinstance(pipeline, str):
+        raise TypeError("pipeline is not text")
+    return FrameLink(
+        file_crs=crs,
+        origin=_array(data["origin"], (3,)),
+        factor=_array(data["factor"], (3,)),
+        pipeline=pipeline,
+        bounds=None if data["bounds"] is None else _array(data["bounds"], (2, 3)),
+        report=dict(data["report"]),
+    )
+
+
+def _array(value: Any, shape: tuple[int, ...]) -> Floats:
+    array = np.asarray(value, np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"expected {shape} finite numbers")
+    return array
+
+
+def _cloudcompare(chain: TransformChain) -> dict[str, Any]:
+    """Give the matrix on shifted coordinates, and the shifts with which it holds."""
+    source, target = _file_origin(chain.source), _file_origin(chain.target)
+    if np.abs(source - target).max() < _SHARED_SHIFT:
+        source = target
+    T = geometry.translation(-target) @ chain.T_file @ geometry.translation(source)
+    # the sums above cancel at far origins; the pivot's image is known to full precision
+    T[:3, 3] = (chain.forward(chain.pivot[None])[0] - target) - T[:3, :3] @ (chain.pivot - source)
+    same = bool((source == target).all())
+    note = "load the source with source_global_shift and apply the matrix to it"
+    if not same:
+        note += "; then set its global shift to target_global_shift, keeping the local coordinates"
+    return {
+        "matrix": T,
+        "source_global_shift": -source,
+        "target_global_shift": -target,
+        "note": note,
+    }
+
+
+def _file_origin(link: FrameLink) -> Floats:
+    """Give whole file units near the link's origin."""
+    return np.asarray(np.rint(link.to_file(np.zeros((1, 3)))[0]))
+
+
+def _row_major(T: Floats) -> str:
+    return " ".join(f"{value:.17g}" for value in T.ravel())
+
+
+def _pdal_link(link: FrameLink, inverse: bool) -> list[dict[str, Any]]:
+    """Give the PDAL stages from file to unshifted work coordinates, or back."""
+    stages: list[dict[str, Any]] = []
+    if link.pipeline is not None:
+        stages.append({"type": "filters.projpipeline", "coord_op": link.pipeline})
+        if inverse:
+            stages[0]["reverse_transfo"] = True
+    if (link.factor != 1.0).any():
+        factor = 1.0 / link.factor if inverse else link.factor
+        scale = {"type": "filters.transformation", "matrix": _row_major(np.diag([*factor, 1.0]))}
+        stages.insert(0 if inverse else len(stages), scale)
+    return stages
