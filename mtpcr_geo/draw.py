@@ -40,7 +40,7 @@ def band_grey(top: NDArray[np.float32], cell: float) -> Picture:
     """
     filled = np.isfinite(top)
     smooth = _masked_blur(top, filled, _SMOOTH_CELLS)
-    around = _masked_mean(top, filled, max(int(round(_LOCAL_MEAN_M / cell)) | 1, 3))
+    around = _masked_mean(top, filled, max(round(_LOCAL_MEAN_M / cell) | 1, 3))
     grey = np.full(top.shape, 127.0, np.float32)
     grey[filled] = 127.0 + _GREY_PER_METRE * (smooth - around)[filled]
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
