@@ -125,9 +125,9 @@ def register(
     from mtpcr_geo.register import register as run
 
     words = {
-        "source_crs": source_crs, "target_crs": target_crs, "local": local, "level": level.value, "cell": cell,
-        "profile": profile, "prior": not no_prior, "seed": seed, "recording": not no_recording, "force": force,
-        "overwrite": overwrite,
+        "source_crs": source_crs, "target_crs": target_crs, "local": local, "level": level.value,
+        "cell": cell, "profile": profile, "prior": not no_prior, "seed": seed,
+        "recording": not no_recording, "force": force, "overwrite": overwrite,
     }  # fmt: skip
     if dump_pipeline:
         typer.echo(dump(build_pipeline(source, target, out, read_options(words))))
@@ -161,7 +161,7 @@ def demo(
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Simulate a town, scan it from a street and from the air, register the two, and compare with the truth."""
+    """Simulate a town, scan it from a street and from the air, register the two, compare with the truth."""
     from mtpcr_geo.demo import run_demo
 
     with _progress(quiet) as progress:

@@ -75,6 +75,7 @@ def build_pipeline(
     """Name the stages of a registration, as pipeline JSON."""
     folder = Path(out)
     where = {name: str(folder / file) for name, file in OUTPUT_NAMES.items()}
+    seed = {"seed": options.seed} if options.seed else {}
     stages: list[dict[str, Any]] = [
         _reader(target, "target"),
         _reader(source, "source"),
@@ -86,12 +87,12 @@ def build_pipeline(
             "target_crs": options.target_crs,
             "source_crs": options.source_crs,
             "local": options.local,
-            "seed": options.seed,
+            **seed,
         },
         {"type": "mtpcr.bev", "tag": "bev", "cell": options.cell},
-        {"type": "mtpcr.match", "tag": "match"},
-        {"type": "mtpcr.lift", "tag": "lift"},
-        {"type": "mtpcr.solve", "tag": "solve"},
+        {"type": "mtpcr.match", "tag": "match", **seed},
+        {"type": "mtpcr.lift", "tag": "lift", **seed},
+        {"type": "mtpcr.solve", "tag": "solve", **seed},
         {"type": "mtpcr.refine", "tag": "refine"},
         {"type": "mtpcr.assess", "tag": "assess"},
         {"type": "mtpcr.write_bev", "filename": where["bev"]},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 from pathlib import Path
 
@@ -22,6 +23,7 @@ class OutputSet:
     def __init__(self, overwrite: bool = False) -> None:
         self.overwrite = overwrite
         self._parts: dict[Path, Path] = {}
+        self._templates: dict[Path, Path] = {}
         self._made_folders: list[Path] = []
 
     def check(self, final: Path) -> None:
@@ -65,6 +67,35 @@ class OutputSet:
         self._parts[final] = part
         return part
 
+    def template(self, final: str | Path) -> Path:
+        """Give the passing name for numbered files: the # in it is for a number, as in PDAL's writers.
+
+        Raises:
+            OutputError: if the folder cannot be written.
+
+        """
+        final = Path(final)
+        part = self.path(final)
+        del self._parts[final]
+        self._templates[final] = part
+        return part
+
+    def adopt(self, final: str | Path) -> None:
+        """Take over the numbered files written under a template's passing name.
+
+        Raises:
+            OutputError: if one of them exists and may not be replaced.
+
+        """
+        final = Path(final)
+        part = self._templates[final]
+        before, after = part.name.split("#", 1)
+        for path in sorted(part.parent.glob(_pattern(part))):
+            number = path.name[len(before) : len(path.name) - len(after)]
+            self._parts[final.with_name(final.name.replace("#", number, 1))] = path
+        for written in self._parts:
+            self.check(written)
+
     def _make_folder(self, folder: Path) -> None:
         missing = []
         while not folder.exists():
@@ -100,9 +131,11 @@ class OutputSet:
 
     def discard(self) -> None:
         """Remove everything not committed, and the folders made for it."""
-        for part in self._parts.values():
+        numbered = [path for part in self._templates.values() for path in part.parent.glob(_pattern(part))]
+        for part in (*self._parts.values(), *numbered):
             part.unlink(missing_ok=True)
         self._parts.clear()
+        self._templates.clear()
         for folder in reversed(self._made_folders):
             if folder.exists() and not any(folder.iterdir()):
                 folder.rmdir()
@@ -113,3 +146,7 @@ class OutputSet:
 
     def __exit__(self, *exc: object) -> None:
         self.discard()
+
+
+def _pattern(template: Path) -> str:
+    return glob.escape(template.name).replace("#", "*", 1)

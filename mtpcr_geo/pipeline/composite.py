@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 
+_HANDED_ON = {
+    "level": ("method", "target_crs", "source_crs", "local", "seed"),
+    "bev": ("cell",),
+    "match": ("seed",),
+    "lift": ("seed",),
+    "solve": ("seed",),
+}
 METHOD = ("level", "bev", "match", "lift", "solve", "refine", "assess")
 
 
@@ -71,12 +78,7 @@ class Register(Stage):
     def _step(self, name: str) -> Stage:
         from mtpcr_geo.pipeline.registry import make_options, stage_types
 
-        words = self.options.model_dump(exclude_none=True)
-        given: dict[str, Any] = {}
-        if name == "level":
-            given = {key: words[key] for key in ("target_crs", "source_crs", "local", "seed") if key in words}
-            given["method"] = words["level"]
-        elif name == "bev" and "cell" in words:
-            given = {"cell": words["cell"]}
         kind = stage_types()[f"mtpcr.{name}"]
+        words = {**self.options.model_dump(), "method": self.options.level}
+        given = {key: words[key] for key in _HANDED_ON.get(name, ())}
         return kind(make_options(self.label, kind.Options, given), f"{self.tag}_{name}")

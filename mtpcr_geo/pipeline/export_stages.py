@@ -92,7 +92,7 @@ class WriteBev(EvidenceWriter):
         """Options of mtpcr.write_bev."""
 
         filename: Path = Field(
-            description="file to write; a # in it becomes 'source' and 'target', since two rasters are two files"
+            description="file to write; a # in it stands for 'source' and 'target', two files"
         )
 
     def writes(self) -> list[Path]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -147,6 +147,43 @@ class LasWriterOptions(StageOptions):
 
     filename: FileName = Field(description="file to write: LAS 1.4; .laz is compressed")
     a_srs: str | None = Field(None, description="CRS to state instead of the cloud's own")
+    compression: Literal["laszip", "lazperf", "true", "none", "false"] | None = Field(
+        None, description="whether to write LAZ; the file's name says it if this does not"
+    )
+    scale_x: float | None = Field(None, gt=0, description="size of the last digit of x, in units of the CRS")
+    scale_y: float | None = Field(None, gt=0, description="size of the last digit of y, in units of the CRS")
+    scale_z: float | None = Field(None, gt=0, description="size of the last digit of z, in units of the CRS")
+    minor_version: Literal[4] = Field(4, description="only LAS 1.4 is written")
+    extra_dims: Literal["all"] = Field("all", description="every extra dimension is kept")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _plain(cls, words: Any) -> Any:
+        compression = words.get("compression") if isinstance(words, dict) else None
+        if isinstance(compression, bool):
+            return {**words, "compression": str(compression).lower()}
+        return words
+
+    @model_validator(mode="after")
+    def _check(self) -> LasWriterOptions:
+        if self.compression is not None:
+            wanted = self.compression not in ("none", "false")
+            if wanted != (self.filename.suffix.lower() == ".laz"):
+                raise ValueError(
+                    f"compression {self.compression} does not suit the name {self.filename.name}; "
+                    "LAZ ends in .laz, LAS in .las"
+                )
+        scales = (self.scale_x, self.scale_y, self.scale_z)
+        if any(scales) and not all(scales):
+            raise ValueError("scale_x, scale_y and scale_z go together; give all three or none")
+        return self
+
+    @property
+    def scale(self) -> tuple[float, float, float] | None:
+        """The scales, where given."""
+        if self.scale_x is None or self.scale_y is None or self.scale_z is None:
+            return None
+        return self.scale_x, self.scale_y, self.scale_z
 
 
 class LasWriter(Stage):
@@ -170,11 +207,12 @@ class LasWriter(Stage):
 
         cloud = one_cloud(self, inputs)
         crs = stated_crs(self, "a_srs", self.options.a_srs) or cloud.crs
+        scale = self.options.scale
         path = context.outputs.path(self.options.filename)
         if isinstance(cloud, Moved):
-            write_cloud(path, cloud.base, cloud.move, crs)
+            write_cloud(path, cloud.base, cloud.move, crs, scale, progress=context.progress)
         else:
-            write_cloud(path, cloud, None, crs)
+            write_cloud(path, cloud, None, crs, scale, progress=context.progress)
         self.metadata |= {"filename": str(self.options.filename), "count": cloud.count}
         return cloud
 
@@ -196,7 +234,8 @@ def one_cloud(stage: Stage, inputs: Sequence[Value]) -> Cloud:
         return inputs[0]
     if len(inputs) == 1:
         raise OptionError(
-            f"{stage.label} needs a cloud and got a pair of clouds; put mtpcr.apply before it, which moves the source"
+            f"{stage.label} needs a cloud and got a pair of clouds; "
+            "put mtpcr.apply before it, which moves the source"
         )
     raise OptionError(
         f"{stage.label} needs one cloud and got {len(inputs)} inputs; name one in its inputs, "

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from mtpcr_geo.errors import OptionError
-from mtpcr_geo.pipeline.grammar import StageSpec
+from pydantic import ValidationError
+
+from mtpcr_geo.errors import MissingPartError, OptionError
+from mtpcr_geo.pipeline import pdal_library, safety
+from mtpcr_geo.pipeline.grammar import StageSpec, file_of
 from mtpcr_geo.pipeline.registry import make_options, stage_types, unknown_type
 from mtpcr_geo.pipeline.stage import Stage
 
@@ -14,6 +18,7 @@ if TYPE_CHECKING:
     from mtpcr_geo.pipeline.runner import Settings
 
 Kind = Literal["cloud", "pair"]
+_PDAL_FAMILIES = ("readers.", "filters.", "writers.")
 
 
 def plan(specs: Sequence[StageSpec], settings: Settings) -> dict[str, Stage]:
@@ -24,15 +29,96 @@ def plan(specs: Sequence[StageSpec], settings: Settings) -> dict[str, Stage]:
         MissingPartError: if a stage needs PDAL and PDAL is not there.
 
     """
+    safety.check(specs, allow_code=settings.allow_code, allow_network=settings.allow_network)
     own = stage_types()
+    by_pdal = served_by_pdal(specs)
     stages: dict[str, Stage] = {}
     for spec in specs:
-        if spec.type not in own:
-            raise unknown_type(spec.label, spec.type, list(own))
-        kind = own[spec.type]
-        stages[spec.tag] = kind(make_options(spec.label, kind.Options, spec.options), spec.tag)
+        if spec.tag in by_pdal:
+            from mtpcr_geo.pipeline.pdal_stages import make_pdal_stage
+
+            stages[spec.tag] = make_pdal_stage(spec)
+        else:
+            kind = own[spec.type]
+            stages[spec.tag] = kind(make_options(spec.label, kind.Options, spec.options), spec.tag)
     _check_kinds(specs)
+    if by_pdal:
+        _connect(specs, stages)
     return stages
+
+
+def served_by_pdal(specs: Sequence[StageSpec]) -> set[str]:
+    """Tell which stages PDAL serves: those only it has, and readers and writers right beside them.
+
+    Raises:
+        OptionError: if neither knows a stage.
+        MissingPartError: if PDAL is needed and not there.
+
+    """
+    by_pdal = {spec.tag for spec in specs if _needs_pdal(spec)}
+    own = stage_types()
+    beside = True
+    while beside:
+        beside = False
+        for spec in specs:
+            edges = [(spec.tag, tag) for tag in spec.inputs]
+            for edge in edges:
+                ends = [end for end in specs if end.tag in edge]
+                if sum(end.tag in by_pdal for end in ends) != 1:
+                    continue
+                other = next(end for end in ends if end.tag not in by_pdal)
+                if other.type.startswith(_PDAL_FAMILIES) and other.type in own and _pdal_has(other):
+                    by_pdal.add(other.tag)
+                    beside = True
+    return by_pdal
+
+
+def _needs_pdal(spec: StageSpec) -> bool:
+    own = stage_types()
+    if not spec.type.startswith(_PDAL_FAMILIES):
+        if spec.type not in own:
+            known = [*own, *pdal_library.drivers()] if pdal_library.available() else list(own)
+            raise unknown_type(spec.label, spec.type, known)
+        return False
+    if spec.type in own:
+        return not _we_can(spec) and _pdal_has(spec)
+    if not pdal_library.available():
+        raise MissingPartError(f"{spec.label} needs PDAL, which is not installed; {pdal_library.INSTALL}")
+    if not _pdal_has(spec):
+        raise unknown_type(spec.label, spec.type, [*own, *pdal_library.drivers()])
+    return True
+
+
+def _we_can(spec: StageSpec) -> bool:
+    words = {key: value for key, value in spec.options.items() if key != "user_data"}
+    try:
+        stage_types()[spec.type].Options.model_validate(words)
+    except ValidationError:
+        return False
+    return spec.type.startswith("readers.") or len(spec.inputs) == 1
+
+
+def _pdal_has(spec: StageSpec) -> bool:
+    return pdal_library.available() and spec.type in pdal_library.drivers()
+
+
+def _connect(specs: Sequence[StageSpec], stages: Mapping[str, Stage]) -> None:
+    """Tell every PDAL stage what stands before it, and whether PDAL must run once it is reached."""
+    from mtpcr_geo.pipeline.pdal_stages import PdalStage
+
+    files: dict[str, Path | None] = {}
+    for spec in specs:
+        stage = stages[spec.tag]
+        name = file_of(spec.options) if spec.type in ("readers.las", "readers.copc") else None
+        # the source comes last, and is what mtpcr.apply moves
+        files[spec.tag] = Path(name) if name else next((files[t] for t in reversed(spec.inputs)), None)
+        if not isinstance(stage, PdalStage):
+            continue
+        takers = [stages[other.tag] for other in specs if spec.tag in other.inputs]
+        stage.upstream = [stages[tag] for tag in spec.inputs]
+        stage.for_us = any(not isinstance(taker, PdalStage) for taker in takers)
+        stage.boundary = stage.for_us or not takers
+        stage.stand_in = files[spec.tag]
 
 
 def _check_kinds(specs: Sequence[StageSpec]) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mtpcr_geo.audit import NullRecorder
 from mtpcr_geo.errors import InputError, MtpcrError, OptionError, RegistrationError
 from mtpcr_geo.export.files import OutputSet
 from mtpcr_geo.pipeline.facts import versions
@@ -98,25 +98,38 @@ def execute(
 
     """
     stages = plan(specs, settings)
+    inputs = _inputs_behind_late(specs, stages)
     with OutputSet(settings.overwrite) as outputs:
         context = _context(specs, outputs, progress or NoProgress(), settings)
-        _check(stages, context)
-        context.facts |= {"versions": versions(), "inputs": _input_facts(stages)}
-        for stage in stages.values():
-            stage.open(context)
-        context.recorder.begin(context.facts)
-        values: dict[str, Value | None] = {}
-        for spec in sorted(specs, key=lambda spec: stages[spec.tag].late):
-            stage = stages[spec.tag]
-            if stage.late and not isinstance(context.recorder, NullRecorder):
-                context.recorder.close()
-                context.recorder = NullRecorder()
-            values[spec.tag] = _turn(stage, [values[tag] for tag in spec.inputs], context)
-        context.recorder.close()
+        with closing(context):
+            _check(stages, context)
+            context.facts |= {"versions": versions(), "inputs": _input_facts(stages)}
+            for stage in stages.values():
+                stage.open(context)
+            context.recorder.begin(context.facts)
+            values: dict[str, Value | None] = {}
+            for spec in sorted(specs, key=lambda spec: stages[spec.tag].late):
+                stage = stages[spec.tag]
+                if stage.late:
+                    context.stop_recording()
+                values[spec.tag] = _turn(stage, [values[tag] for tag in inputs[spec.tag]], context)
         if context.failure is not None and not any(stage.evidence for stage in stages.values()):
             raise RegistrationError(context.failure)
         written = outputs.commit()
     return RunResult(values, context.done, written, context.failure, context.facts)
+
+
+def _inputs_behind_late(
+    specs: Sequence[StageSpec], stages: Mapping[str, Stage]
+) -> dict[str, tuple[str, ...]]:
+    """Let what takes from a late stage take from before it: a late stage hands on what it was given."""
+    inputs: dict[str, tuple[str, ...]] = {}
+    for spec in specs:
+        found: tuple[str, ...] = ()
+        for tag in spec.inputs:
+            found += inputs[tag] if stages[tag].late else (tag,)
+        inputs[spec.tag] = found
+    return inputs
 
 
 def _context(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -49,6 +50,7 @@ class RunContext:
         done: one entry a finished stage (type, tag, options, seconds, metadata), in order.
         facts: what holds for the whole run: the pipeline, versions, input files and their hashes.
         failure: why the registration has nothing to go on with, once a stage said so.
+        spooled: passing files of clouds that were handed to PDAL, by the cloud's id.
 
     """
 
@@ -60,6 +62,26 @@ class RunContext:
     done: list[dict[str, Any]] = field(default_factory=list)
     facts: dict[str, Any] = field(default_factory=dict)
     failure: str | None = None
+    spooled: dict[int, Path] = field(default_factory=dict)
+    _scratch: tempfile.TemporaryDirectory[str] | None = None
+
+    def scratch(self) -> Path:
+        """Give a folder for passing files, gone when the run ends."""
+        if self._scratch is None:
+            self._scratch = tempfile.TemporaryDirectory(prefix="mtpcr-geo-")
+        return Path(self._scratch.name)
+
+    def close(self) -> None:
+        """Remove passing files, and finish the recording."""
+        if self._scratch is not None:
+            self._scratch.cleanup()
+            self._scratch = None
+        self.stop_recording()
+
+    def stop_recording(self) -> None:
+        """Finish the recording: nothing later is recorded."""
+        recorder, self.recorder = self.recorder, NullRecorder()
+        recorder.close()
 
 
 class Stage(ABC):
