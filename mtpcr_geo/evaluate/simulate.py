@@ -29,7 +29,7 @@ from mtpcr_geo.evaluate.sim.scanners import Block
 from mtpcr_geo.evaluate.sim.site import MARGIN_M, Site, make_site
 from mtpcr_geo.export.files import OutputSet
 
-__all__ = ["KINDS", "Kind", "SimulatedPair", "simulate_pair", "write_pair"]
+__all__ = ["KINDS", "Kind", "SimulatedPair", "describe", "simulate_pair", "write_laz", "write_pair"]
 
 Floats = NDArray[np.float64]
 Ground = Literal["robot", "tripod"]
@@ -292,8 +292,8 @@ def write_laz(path: Path, cloud: ArrayCloud) -> None:
     las.write(str(path))
 
 
-def describe(pair: SimulatedPair) -> dict[str, Any]:
-    """Give what ``pair.json`` says: CRS, truth, overlap, the two clouds, how it was made."""
+def describe(pair: SimulatedPair, names: tuple[str, str] = ("source.laz", "target.laz")) -> dict[str, Any]:
+    """Give what ``pair.json`` says: CRS, truth, overlap, the two clouds by file name, how it was made."""
     crs = pair.target.crs
     return {
         "id": pair.name,
@@ -309,8 +309,8 @@ def describe(pair: SimulatedPair) -> dict[str, Any]:
             "target_cells_near_source": round(pair.overlap_target, 4),
             "note": "share of occupied 1 m cells with one of the other among it and its 8 neighbours",
         },
-        "source": _cloud_facts("source.laz", pair.source),
-        "target": _cloud_facts("target.laz", pair.target),
+        "source": _cloud_facts(names[0], pair.source),
+        "target": _cloud_facts(names[1], pair.target),
         "simulation": pair.options,
     }
 

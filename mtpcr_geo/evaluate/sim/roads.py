@@ -121,10 +121,11 @@ def make_network(half: float, style: RoadStyle, rng: np.random.Generator) -> Net
     """Lay a road network over a square of edge ``2 * half`` metres about the origin."""
     yaw = rng.uniform(-0.5, 0.5)
     reach = 1.5 * half
-    counts = [int(np.ceil(2 * reach / s)) + 1 for s in style.spacing]
+    spacing = [min(s, 0.7 * half) for s in style.spacing]  # a small site has roads too
+    counts = [int(np.ceil(2 * reach / s)) + 1 for s in spacing]
     u, v = np.meshgrid(*(np.arange(k) - (k - 1) / 2 for k in counts))
     u, v = u + rng.uniform(-0.4, 0.4), v + rng.uniform(-0.4, 0.4)
-    grid = np.stack([u * style.spacing[0], v * style.spacing[1]], -1).reshape(-1, 2)
+    grid = np.stack([u * spacing[0], v * spacing[1]], -1).reshape(-1, 2)
     grid += rng.normal(0, style.jitter, grid.shape)
     number = np.arange(len(grid)).reshape(u.shape)
     along = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], 1)
@@ -154,7 +155,8 @@ def make_network(half: float, style: RoadStyle, rng: np.random.Generator) -> Net
         lines.append(bend(grid[a] + t * (grid[b] - grid[a])))
     nodes = bend(grid)
     inside = np.abs(nodes).max(axis=1) < half + 5.0
-    kept &= inside[edges].all(axis=1)
+    within = inside[edges].all(axis=1)
+    kept = kept & within if (kept & within).any() else within
     n = len(nodes)
     i, j = edges[kept].T
     _, label = connected_components(csr_matrix((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)

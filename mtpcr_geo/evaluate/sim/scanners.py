@@ -221,15 +221,17 @@ def uav_beams(
     Args:
         block: what to cover.
         ground: height of the ground.
-        density: beams per square metre that point at the ground within 55 degrees of the plumb line.
+        density: beams per square metre of level ground, about.
         rng: source of chance.
         height_m: flying height above the median ground, metres.
         spacing_m: distance of neighbouring lines, metres.
         speed: metres per second.
 
     """
-    count = int(density * block.area)
     width, length = block.high - block.low
+    # many beams fall beside the block; a fringe of this width stands for them
+    fringe = 0.4 * height_m * np.tan(np.deg2rad(55.0))
+    count = int(density * (width + 2 * fringe) * (length + 40.0))
     lines = max(1, int(np.ceil(width / spacing_m)))
     which = rng.integers(0, lines, count)
     v = rng.uniform(block.low[1] - 20, block.high[1] + 20, count)
