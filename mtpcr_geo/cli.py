@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 import mtpcr_geo
-from mtpcr_geo.errors import EXIT_DOUBTFUL, EXIT_REFUSED, MtpcrError
+from mtpcr_geo.errors import EXIT_DOUBTFUL, EXIT_REFUSED, MtpcrError, OptionError
 
 if TYPE_CHECKING:
     from mtpcr_geo.pipeline.stage import Progress
@@ -138,6 +138,63 @@ def register(
     raise typer.Exit(EXIT_BY_VERDICT[result.verdict.name])
 
 
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def pipeline(
+    context: typer.Context,
+    file: Annotated[
+        Path | None, typer.Argument(help="Pipeline JSON; - reads standard input.", show_default=False)
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--validate", help="Check grammar, options, files and CRS; run nothing.")
+    ] = False,
+    metadata: Annotated[
+        Path | None, typer.Option(help="Write what the stages noted to this JSON file.", show_default=False)
+    ] = None,
+    progress: Annotated[
+        bool, typer.Option("--progress", help="Show bars even where standard error is no terminal.")
+    ] = False,
+    schema: Annotated[
+        bool, typer.Option("--schema", help="Print the JSON Schema of pipelines, for editors.")
+    ] = False,
+    allow_code: Annotated[
+        bool, typer.Option("--allow-code", help="Let stages such as filters.python run code.")
+    ] = False,
+    allow_network: Annotated[
+        bool, typer.Option("--allow-network", help="Let stages read remote or virtual (/vsi) files.")
+    ] = False,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Run a pipeline of our stages and PDAL's, written as PDAL's JSON.
+
+    Options of stages are changed by --TYPE.OPTION=VALUE, such as --readers.las.filename=a.laz, or by
+    --TAG.OPTION=VALUE. Relative filenames are relative to the current folder.
+    """
+    from mtpcr_geo import commands
+
+    if schema:
+        commands.print_schema()
+        return
+    if file is None:
+        raise OptionError("name a pipeline file, or - for standard input")
+    with _progress(quiet, always=progress) as bars:
+        outcome = commands.run_pipeline(
+            file,
+            context.args,
+            check=check,
+            metadata=metadata,
+            overwrite=overwrite,
+            allow_code=allow_code,
+            allow_network=allow_network,
+            progress=bars,
+        )
+    commands.print_outcome(outcome, as_json=as_json, verbose=verbose, quiet=quiet)
+    verdict = outcome.verdict if outcome is not None else None
+    raise typer.Exit(EXIT_BY_VERDICT[verdict.name] if verdict is not None else 0)
+
+
 @app.command()
 def apply(
     transform: Annotated[Path, typer.Argument(help="A transform.json of a run.", show_default=False)],
@@ -184,15 +241,15 @@ def _interrupt(signum: int, frame: object) -> None:
 
 
 @contextmanager
-def _progress(quiet: bool) -> Iterator[Progress]:
+def _progress(quiet: bool, always: bool = False) -> Iterator[Progress]:
     from mtpcr_geo.progress import NoProgress, RichProgress
 
-    if quiet or not sys.stderr.isatty():
+    if quiet or not (always or sys.stderr.isatty()):
         yield NoProgress()
         return
     from rich.console import Console
 
-    with RichProgress(Console(stderr=True)) as bars:
+    with RichProgress(Console(stderr=True, force_terminal=True if always else None)) as bars:
         yield bars
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from mtpcr_geo import geometry
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from mtpcr_geo.pipeline.runner import RunResult
     from mtpcr_geo.register import Registration
 
 _COLOUR = {"accepted": "bold green", "doubtful": "bold yellow", "refused": "bold red"}
@@ -40,12 +41,24 @@ def print_registration(console: Console, result: Registration, *, verbose: bool 
     if facts.row_count:
         console.print(facts)
     if verbose:
-        _print_stages(console, result)
+        _print_stages(console, result.report)
     for what, path in result.outputs.items():
         if what in _OPEN_WITH:
             console.print(Text(f"  {path}"), Text(_OPEN_WITH[what], "dim"), soft_wrap=True)
     if name == "refused" and "registered" not in result.outputs:
         console.print(Text("  no registered cloud was written; --force writes it all the same", "dim"))
+
+
+def print_run(console: Console, result: RunResult, *, verbose: bool = False) -> None:
+    """Print what a pipeline came to: the registration if it holds one, else its files."""
+    from mtpcr_geo.register import registration_of
+
+    if result.verdict is not None:
+        print_registration(console, registration_of(result), verbose=verbose)
+    elif verbose:
+        _print_stages(console, result.done)
+    for path in result.outputs:
+        console.print(f"  wrote {path}", soft_wrap=True, markup=False)
 
 
 def _transform_rows(result: Registration) -> list[tuple[str, str]]:
@@ -79,7 +92,7 @@ def _number(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _print_stages(console: Console, result: Registration) -> None:
-    for entry in result.report:
+def _print_stages(console: Console, done: Sequence[Mapping[str, Any]]) -> None:
+    for entry in done:
         note = entry.get("skipped") or entry.get("failed") or ""
         console.print(f"  {entry['seconds']:8.2f} s  {entry['tag']} ({entry['type']}) {note}", soft_wrap=True)

@@ -239,4 +239,4 @@ def _share_metadata(stages: Sequence[PdalStage], metadata: Any) -> None:
         part = by_type.get(kind, {})
         parts = part if isinstance(part, list) else [part]
         for stage, one in zip(alike, parts if len(parts) == len(alike) else [part] * len(alike), strict=True):
-            stage.metadata = one if isinstance(one, dict) else {"of_all_stages_of_this_type": one}
+            stage.metadata.update(one if isinstance(one, dict) else {"of_all_stages_of_this_type": one})

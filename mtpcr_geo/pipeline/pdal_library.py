@@ -5,6 +5,7 @@ Nothing about PDAL is assumed: stages and options are asked of the library that 
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import json
 from collections.abc import Mapping, Sequence
@@ -56,7 +57,9 @@ def drivers() -> dict[str, Driver]:
         MissingPartError: if the package is there but does not load.
 
     """
-    library = load().libpdalpython
+    load()
+    # the package does not keep its extension module as an attribute
+    library = importlib.import_module("pdal.libpdalpython")
     options = library.getOptions()
     return {
         driver["name"]: Driver(
@@ -78,7 +81,6 @@ def load() -> Any:
     """
     try:
         import pdal
-        import pdal.libpdalpython
     except ImportError as error:
         raise MissingPartError(f"the package pdal does not load ({error}); {INSTALL}") from error
     return pdal

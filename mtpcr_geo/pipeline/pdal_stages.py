@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from mtpcr_geo.pipeline.pdal_cloud import PdalCloud, Step
 from mtpcr_geo.pipeline.stage import RunContext, Stage, StageOptions, Value
 from mtpcr_geo.pipeline.words import meant
 
+# the name under which a file is written until the run is whole
+_PASSING = re.compile(r"\.([^/\\]+)\.part-\d+(\.\w+)")
 _NO_POINTS = {"type": "readers.faux", "count": 1, "mode": "constant", "bounds": "([0, 1], [0, 1], [0, 1])"}
 
 
@@ -91,7 +94,7 @@ class PdalStage(Stage):
 
     def failed(self, message: str) -> MtpcrError:
         """Put what PDAL says in one line that names this stage."""
-        detail = message.removeprefix(f"{self.spec.type}: ")
+        detail = _PASSING.sub(r"\1\2", message.removeprefix(f"{self.spec.type}: "))
         text = f"{self.label}: PDAL says: {detail}"
         if "argument" in detail or "Couldn't create" in detail or "option" in detail.lower():
             return OptionError(text)
