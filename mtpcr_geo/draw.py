@@ -231,7 +231,7 @@ def edge_overlay(source: Bev, target: Bev) -> Picture:
     for bev, colour, opacity in ((target, TARGET_RGB, 0.8), (source, SOURCE_RGB, 0.85)):
         edges = step_edges(bev.top)[..., None] * opacity
         out = out * (1.0 - edges) + np.array(colour, np.float64) * edges
-    return np.clip(out, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(out, 0, 255), np.uint8)
 
 
 def checkerboard(source: Bev, target: Bev, tile_m: float = 20.0) -> Picture:
@@ -244,7 +244,7 @@ def checkerboard(source: Bev, target: Bev, tile_m: float = 20.0) -> Picture:
         shade = hillshade(bev.top, grid.cell).astype(np.float32)[..., None] / 255.0
         tint = np.array(colour, np.float32) * 0.5 + 127.0
         tints.append(np.where(np.isfinite(bev.top)[..., None], shade * tint, np.array(EMPTY_RGB)))
-    return np.clip(np.where(of_source, tints[0], tints[1]), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.where(of_source, tints[0], tints[1]), 0, 255), np.uint8)
 
 
 def step_edges(top: NDArray[np.float32]) -> Floats:

@@ -120,10 +120,10 @@ def make_pair(
     if state == "matched":
         return pair
     inlier = np.arange(m) >= 12
-    withheld = np.arange(m) % 5 == 0
+    fold = np.arange(m) % 5
     if state == "tied":
         inlier = np.ones(m, bool)
-    pair = pair.with_(ties=Ties(source_xyz, target_xyz, score, withheld, inlier))
+    pair = pair.with_(ties=Ties(source_xyz, target_xyz, score, fold, fold == 0, inlier))
     if state == "tied":
         return pair
     T_work = T @ source.T_level_work

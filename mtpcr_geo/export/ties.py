@@ -16,6 +16,8 @@ from mtpcr_geo.scene import Pair
 Floats = NDArray[np.float64]
 Fields = dict[str, NDArray[Any]]
 
+_FOOTPRINT_POINTS = 40_000
+
 
 def write_ties(path: str | Path, pair: Pair) -> None:
     """Write what links the clouds, as far as the run came, for looking at in a GIS.
@@ -66,14 +68,35 @@ def tie_positions(pair: Pair) -> tuple[Floats, Floats | None]:
     return target, geometry.apply(T_target_levelled, pair.ties.source)
 
 
-def outline(xyz: Floats) -> Floats:
-    """Give the convex outline seen from above of (n, 3) points as a closed (m, 2) ring, metres."""
+def outline(plan: Floats) -> NDArray[np.int64]:
+    """Give the indices of those of (n, 2) points that make their convex outline, in order."""
     import cv2
 
-    plan = np.asarray(xyz, np.float64)[:, :2]
-    middle = plan.mean(axis=0)
-    hull = cv2.convexHull((plan - middle).astype(np.float32))[:, 0, :].astype(np.float64) + middle
-    return np.vstack([hull, hull[:1]])
+    near = np.asarray(plan[:, :2] - plan[:1, :2], np.float32)
+    return np.asarray(cv2.convexHull(near, returnPoints=False)[:, 0], np.int64)
+
+
+def footprints(pair: Pair) -> dict[str, Floats]:
+    """Give the convex outlines, as closed (m, 2) rings in work coordinates of the target, metres.
+
+    Some ten thousand points of each sample are looked at: enough for a footprint.
+
+    Returns:
+        the rings by role: the target's, and the registered source's once there is a transform; a cloud
+        without points has none.
+
+    """
+    rings: dict[str, Floats] = {}
+    for side in (pair.target, pair.source):
+        T = pair.T_target_source if side.role == "source" else np.eye(4)
+        if T is None or len(side.sample) == 0:
+            continue
+        some = side.sample[:: max(1, len(side.sample) // _FOOTPRINT_POINTS)]
+        # the outermost points stay outermost: moving them alone spares moving all
+        placed = geometry.apply(T, some[outline(some)])
+        ring = placed[outline(placed), :2]
+        rings[side.role] = np.vstack([ring, ring[:1]])
+    return rings
 
 
 def _ties(pair: Pair) -> Layer:
@@ -117,32 +140,25 @@ def _links(pair: Pair) -> Layer:
 
 
 def _footprints(pair: Pair) -> Layer:
-    rings, roles, files, counts = [], [], [], []
-    placed = [(pair.target, pair.target.sample)]
-    if pair.T_target_source is not None:
-        placed.append((pair.source, geometry.apply(pair.T_target_source, pair.source.sample)))
-    for side, xyz in placed:
-        if len(xyz) == 0:
-            continue
-        rings.append(outline(xyz) + pair.frame.origin[:2])
-        roles.append(side.role)
-        files.append(Path(side.cloud.name).name)
-        counts.append(side.cloud.count)
+    rings = footprints(pair)
+    sides = [{"source": pair.source, "target": pair.target}[role] for role in rings]
     fields: Fields = {
-        "role": np.array(roles, str),
-        "cloud": np.array(files, str),
-        "points": np.array(counts, np.int64),
+        "role": np.array(list(rings), str),
+        "cloud": np.array([Path(side.cloud.name).name for side in sides], str),
+        "points": np.array([side.cloud.count for side in sides], np.int64),
     }
+    shapes = [ring + pair.frame.origin[:2] for ring in rings.values()]
     about = "convex outlines of the target and of the source as the transform places it"
-    return Layer("footprints", "POLYGON", rings, fields, about, styles.footprint_style())
+    return Layer("footprints", "POLYGON", shapes, fields, about, styles.footprint_style())
 
 
 def _hypotheses(pair: Pair) -> Layer:
     assert pair.matches is not None
     every = pair.matches.hypotheses
-    middle = pair.source.levelled_sample.mean(axis=0)
+    corners = np.stack([pair.source.sample.min(axis=0), pair.source.sample.max(axis=0)])
+    middle = geometry.apply(pair.source.T_level_work, corners.mean(axis=0, keepdims=True))[0]
     T_work_levelled = geometry.inverse(pair.target.T_level_work)
-    height = float(np.median(pair.target.levelled_sample[:, 2]))
+    height = float(np.median(pair.target.sample[:: max(1, len(pair.target.sample) // 10_000), 2]))
     places = []
     for one in every:
         plan = geometry.yaw_matrix(one.yaw)[:2, :2] @ middle[:2] + np.asarray(one.shift)
