@@ -166,12 +166,16 @@ class WriteTransform(EvidenceWriter):
 
     def write(self, pair: Pair, context: RunContext) -> None:
         """Write the file in its format."""
-        from mtpcr_geo.export import transform
+        from mtpcr_geo.export.transform import (
+            write_cloudcompare_matrix,
+            write_pdal_pipeline,
+            write_transform_json,
+        )
 
         write = {
-            "json": transform.write_transform_json,
-            "cloudcompare": transform.write_cloudcompare_matrix,
-            "pdal": transform.write_pdal_pipeline,
+            "json": write_transform_json,
+            "cloudcompare": write_cloudcompare_matrix,
+            "pdal": write_pdal_pipeline,
         }[self.format]
         write(context.outputs.path(self.options.filename), pair)
 

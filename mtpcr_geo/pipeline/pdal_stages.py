@@ -80,7 +80,7 @@ class PdalStage(Stage):
         problem = pdal_library.problem_of(list(chain.values()))
         # without the true cloud, PDAL cannot know which dimensions there will be
         if problem and not (guessed and "dimension" in problem.lower()):
-            raise self.failed(problem)
+            raise self.failed(problem, preparing=True)
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Join the chain; at its end, run it all in PDAL."""
@@ -92,11 +92,11 @@ class PdalStage(Stage):
             cloud.evaluate(context, need_crs=self.for_us)
         return cloud
 
-    def failed(self, message: str) -> MtpcrError:
+    def failed(self, message: str, *, preparing: bool = False) -> MtpcrError:
         """Put what PDAL says in one line that names this stage."""
         detail = _PASSING.sub(r"\1\2", message.removeprefix(f"{self.spec.type}: "))
         text = f"{self.label}: PDAL says: {detail}"
-        if "argument" in detail or "Couldn't create" in detail or "option" in detail.lower():
+        if "argument" in detail or (preparing and not self.is_reader):
             return OptionError(text)
         return OutputError(text) if self.is_writer else InputError(text)
 

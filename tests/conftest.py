@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyproj import CRS
+
+from mtpcr_geo import geometry
+from mtpcr_geo.cloud.base import ArrayCloud
+from mtpcr_geo.cloud.write import write_cloud
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+def _shared(name: str) -> Path:
+    folder = REPOSITORY.parent / "shared" / name
+    if not folder.is_dir():
+        pytest.skip(f"../shared/{name} is not there")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real lidar pairs, which stays outside the project."""
+    return _shared("data")
+
+
+@pytest.fixture(scope="session")
+def shared_models() -> Path:
+    """The folder of model files, which stays outside the project."""
+    return _shared("models")
+
+
+@pytest.fixture(scope="session")
+def pdal():
+    """The pdal package; tests that need it skip where it is not installed."""
+    return pytest.importorskip("pdal", reason="PDAL is not installed")
+
+
+@pytest.fixture(scope="session")
+def town_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two small LAZ files of one made-up town: the source, turned and shifted, and the target."""
+    from helpers_scene import ORIGIN, town
+
+    rng = np.random.default_rng(7)
+    folder = tmp_path_factory.mktemp("town")
+    target = town(rng, 60_000) + ORIGIN
+    source = town(rng, 40_000)
+    turn = geometry.compose(geometry.yaw_matrix(np.deg2rad(-61.0)), np.array([14.0, -9.0, 2.5]))
+    source = geometry.apply(turn, source[source[:, 0] > -30.0]) + ORIGIN
+    files = []
+    for name, xyz in (("source", source), ("target", target)):
+        extra = {
+            "Intensity": rng.integers(0, 2000, len(xyz)).astype(np.uint16),
+            "Classification": np.where(xyz[:, 2] > ORIGIN[2] + 5.0, 6, 2).astype(np.uint8),
+            "GpsTime": np.arange(len(xyz)) * 1e-3,
+        }
+        cloud = ArrayCloud(xyz, CRS.from_epsg(25833), name, extra)
+        write_cloud(folder / f"{name}.laz", cloud, None, cloud.crs)
+        files.append(folder / f"{name}.laz")
+    return files[0], files[1]
