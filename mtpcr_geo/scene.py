@@ -110,7 +110,8 @@ class Ties:
     Attributes:
         source, target: (n, 3) float64.
         score: (n,) in 0..1.
-        withheld: (n,) bool, True for ties kept from the solve to judge it.
+        fold: (n,) which of the folds a tie is in, for cross-validation.
+        withheld: (n,) bool, True for ties kept from the solve to judge it: the first fold.
         inlier: (n,) bool, True for ties that agree with the solved transform.
 
     """
@@ -118,6 +119,7 @@ class Ties:
     source: Floats
     target: Floats
     score: Floats
+    fold: NDArray[np.int64]
     withheld: NDArray[np.bool_]
     inlier: NDArray[np.bool_]
 

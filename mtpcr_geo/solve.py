@@ -6,12 +6,13 @@ a shift remain, two ties determine them, and RANSAC over pairs of ties gives a s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo import geometry
+from mtpcr_geo.errors import RegistrationError
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -168,3 +169,65 @@ def iterative_svd(
             break
         inlier = now
     return Solution(T, inlier, rounds, threshold)
+
+
+def solve_ties(
+    source: Floats,
+    target: Floats,
+    score: Floats,
+    withheld: Mask,
+    *,
+    tolerance: float,
+    robust_start: bool = True,
+    upright: bool = True,
+    seed: int = 0,
+) -> tuple[Solution, Mask]:
+    """Solve the transform from the ties not withheld: robust start, then iterative SVD.
+
+    Args:
+        source, target: (n, 3) levelled ties, metres.
+        score: (n,) weights of the ties, squared in the fit.
+        withheld: (n,) ties to leave out.
+        tolerance: plan residual up to which a tie may agree with a pose, metres; about 1.5 cells.
+        robust_start: begin from the yaw and shift that RANSAC finds; else from all ties, as in the paper.
+        upright: solve yaw and shift, trusting the levelling; else all six degrees of freedom.
+        seed: of RANSAC.
+
+    Returns:
+        The solution, whose inlier mask covers the used ties only, and the (n,) mask of all ties within
+        the final threshold in plan, withheld ones included.
+
+    Raises:
+        RegistrationError: if fewer ties agree than a transform needs.
+
+    """
+    used = np.flatnonzero(~withheld)
+    least = 3
+    if len(used) < least:
+        raise RegistrationError(
+            f"only {len(used)} ties to solve a transform from, at least {least} are needed; "
+            "the clouds share too little, or another --cell or matcher may find more"
+        )
+    s, t = source[used], target[used]
+    start = None
+    if robust_start:
+        _, start = ransac_upright(s, t, tolerance, seed)
+        if start.sum() < least:
+            raise RegistrationError(
+                f"of {len(used)} ties no {least} agree on one yaw and shift; the clouds may not overlap"
+            )
+    weight = np.maximum(score[used], 0.05) ** 2
+    flat = np.array([1.0, 1.0, 0.0])
+    if upright:
+        # heights of single ties are rough, so they have no say in plan and are settled by their median
+        solution = iterative_svd(
+            s * flat, t * flat, start=start, weight=weight, floor=tolerance, upright=True
+        )
+        moved = geometry.apply(solution.T, s)
+        rise = float(np.median((t - moved)[solution.inlier, 2]))
+        T = geometry.translation((0.0, 0.0, rise)) @ solution.T
+        solution = replace(solution, T=T)
+    else:
+        solution = iterative_svd(s, t, start=start, weight=weight, floor=tolerance)
+    plan = np.hypot(*(geometry.apply(solution.T, source) - target)[:, :2].T)
+    return solution, plan < max(tolerance, solution.threshold)

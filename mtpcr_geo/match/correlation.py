@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo import geometry
 from mtpcr_geo.bev import coarsen
+from mtpcr_geo.chance import chance_within, surprise
 from mtpcr_geo.enhance import channels
 from mtpcr_geo.errors import RegistrationError
 from mtpcr_geo.match.local import PatchMatches, match_patches
@@ -30,8 +30,13 @@ SEARCH_CELLS_M = (8.0, 4.0, 2.0)
 LARGEST_SEARCH = 420
 """Cells along a raster's side up to which a level is searched over all yaws in about two seconds."""
 PEAKS_A_YAW = 3
-HYPOTHESES = 6
-JUDGED_BY_PATCHES = 2
+HYPOTHESES = 10
+HOPELESS_BELOW = 0.5
+"""Share of the best score below which a hypothesis is not followed further."""
+REACH_CELLS = 4
+"""How far the final patch matches may lie from where the pose puts them, cells."""
+AGREE_CELLS = 1.5
+LARGEST_MARGIN = 1000.0
 
 
 @dataclass(frozen=True)
@@ -45,7 +50,7 @@ class CorrelationSettings:
         min_overlap_m2: smallest overlap considered, square metres.
         min_overlap_share: smallest overlap considered, as a share of the smaller raster.
         convincing_margin: best over next distinct score at fine cells that ends the search.
-        convincing_support: share of patch matches that must agree on one pose to end it.
+        convincing_surprise: digits of improbability of its patches' agreement that end it.
 
     """
 
@@ -55,7 +60,7 @@ class CorrelationSettings:
     min_overlap_m2: float = 400.0
     min_overlap_share: float = 0.03
     convincing_margin: float = 1.5
-    convincing_support: float = 0.5
+    convincing_surprise: float = 8.0
 
 
 @dataclass(frozen=True)
@@ -77,10 +82,26 @@ class Candidate:
 
     @property
     def support(self) -> float:
-        """Share of all patches tried that found a peak and agree on one pose."""
-        if self.patches is None or self.supporting is None or not self.patches.patches:
+        """Share of all patches tried that agree on one pose, less the two that any pose can please."""
+        if self.patches is None or self.supporting is None:
             return 0.0
-        return float(self.supporting.sum()) / self.patches.patches
+        return max(float(self.supporting.sum()) - 2.0, 0.0) / max(self.patches.patches, 8)
+
+    @property
+    def surprise(self) -> float:
+        """Digits of improbability that so many of the patches matched agree by chance."""
+        if self.patches is None or self.supporting is None:
+            return 0.0
+        agreeing = max(int(self.supporting.sum()) - 2, 0)
+        return surprise(agreeing, len(self.patches), chance_within(AGREE_CELLS, REACH_CELLS - 0.5))
+
+    @property
+    def strength(self) -> float:
+        """Score times support: what hypotheses are ranked by.
+
+        Repetitive scenes give high scores to wrong poses with a large overlap; their patches disagree.
+        """
+        return self.pose.score * self.support
 
 
 def match(
@@ -106,24 +127,17 @@ def match(
 
     """
     pyramid = Pyramid(source, target)
-    levels = search_factors(source, target)
     pool: list[Candidate] = []
-    report: dict[str, Any] = {"cell_m": source.grid.cell, "searched": []}
-    for factor in levels:
+    searched = []
+    for factor in search_factors(source, target):
         found = _search(pyramid, factor, settings, advance)
-        report["searched"].append(
-            {"cell_m": source.grid.cell * factor, "scores": [round(pose.score, 3) for pose in found]}
-        )
-        pool = _rank([*pool, *(_descend(pyramid, factor, pose) for pose in found)])
-        pool = [
-            _judge_by_patches(pyramid, candidate, settings, seed) if i < JUDGED_BY_PATCHES else candidate
-            for i, candidate in enumerate(pool)
-        ]
-        pool = sorted(pool, key=lambda c: -c.pose.score)
+        searched.append({"cell_m": source.grid.cell * factor, "scores": [round(p.score, 3) for p in found]})
+        pool = _distinct([*pool, *(_descend(pyramid, factor, pose) for pose in found)])
+        pool = _distinct([_judge_by_patches(pyramid, c, settings, seed) for c in _worth_judging(pool)])
         if (
             pool
             and margin_of(pool) >= settings.convincing_margin
-            and pool[0].support >= settings.convincing_support
+            and pool[0].surprise >= settings.convincing_surprise
         ):
             break
     if not pool:
@@ -135,12 +149,17 @@ def match(
     matches = best.patches
     assert matches is not None  # the best hypotheses are always judged by patches
     pivot = centre_of(source.grid)
-    report |= {
+    report = {
+        "cell_m": source.grid.cell,
+        "reach_m": (REACH_CELLS - 0.5) * source.grid.cell,
+        "searched": searched,
         "margin": margin_of(pool),
         "support": best.support,
+        "surprise_digits": best.surprise,
         "support_next": max((c.support for c in pool[1:]), default=0.0),
         "patches": matches.patches,
         "scores": [round(c.pose.score, 3) for c in pool],
+        "strengths": [round(c.strength, 3) for c in pool],
     }
     return Matches(
         source_px=matches.source_px,
@@ -189,10 +208,10 @@ def search_factors(source: Bev, target: Bev) -> list[int]:
 
 
 def margin_of(pool: Sequence[Candidate]) -> float:
-    """Best score over that of the next distinct hypothesis; infinite where there is no other."""
-    if len(pool) < 2:
-        return float("inf")
-    return pool[0].pose.score / max(pool[1].pose.score, 1e-9)
+    """Strength of the best over that of the next distinct hypothesis, 1000 at most."""
+    if len(pool) < 2 or pool[1].strength <= 0.0:
+        return LARGEST_MARGIN if pool and pool[0].strength > 0.0 else 1.0
+    return min(pool[0].strength / pool[1].strength, LARGEST_MARGIN)
 
 
 def _search(
@@ -206,7 +225,8 @@ def _search(
     yaws = np.arange(steps) * (2 * np.pi / steps)
     search = GlobalSearch(source, target, fewest)
     poses = search.run(yaws, PEAKS_A_YAW, 4, advance)
-    return distinct(poses, HYPOTHESES, np.radians(2 * settings.yaw_step_deg), 5 * cell)
+    apart = distinct(poses, HYPOTHESES, np.radians(2 * settings.yaw_step_deg), 5 * cell)
+    return [pose for i, pose in enumerate(apart) if i < 3 or pose.score >= HOPELESS_BELOW * apart[0].score]
 
 
 def _descend(pyramid: Pyramid, factor: int, pose: Pose) -> Candidate:
@@ -232,13 +252,17 @@ def _descend(pyramid: Pyramid, factor: int, pose: Pose) -> Candidate:
         level, step, window = finer, step / 2, 3
 
 
-def _rank(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Sort by the score at fine cells, and join those that came down to the same place."""
+def _worth_judging(pool: Sequence[Candidate]) -> list[Candidate]:
+    """Leave out what scores far below the best; the runner-up always stays, for the margin's sake."""
+    best = max((c.pose.score for c in pool), default=0.0)
+    return [c for i, c in enumerate(pool) if i < 2 or c.pose.score >= HOPELESS_BELOW * best]
+
+
+def _distinct(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Sort by strength, then score, and join those that came down to the same place."""
     kept: list[Candidate] = []
-    for candidate in sorted(candidates, key=lambda c: -c.pose.score):
-        if not np.isfinite(candidate.pose.score):
-            continue
-        if all(not _same(candidate.pose, other.pose) for other in kept):
+    for candidate in sorted(candidates, key=lambda c: (-c.strength, -c.pose.score)):
+        if np.isfinite(candidate.pose.score) and not any(_same(candidate.pose, k.pose) for k in kept):
             kept.append(candidate)
     return kept[:HYPOTHESES]
 
@@ -258,34 +282,40 @@ def _judge_by_patches(
     source, target = pyramid.at(1)
     cell = source.grid.cell
     stride = max(4, round(settings.patch_m / 2 / cell))
-    window = max(3, round(settings.reach_m / cell))
-    pose, patches = candidate.pose, None
-    supporting = np.zeros(0, bool)
-    for reach in (window, max(3, window // 2)):
-        patches = match_patches(source, target, pose, window=reach, stride=stride)
-        s, t = source.grid.to_metres(patches.source_px), target.grid.to_metres(patches.target_px)
-        T, supporting = ransac_upright(s, t, 1.5 * cell, seed, 500)
-        if supporting.sum() < 4:
-            break
-        flat = np.zeros((len(s), 1))
-        solution = iterative_svd(
-            np.hstack([s, flat]),
-            np.hstack([t, flat]),
-            start=supporting,
-            weight=patches.score**2,
-            floor=1.5 * cell,
-            upright=True,
-        )
-        pivot = centre_of(source.grid)
-        place = geometry.apply(solution.T, np.array([[pivot[0], pivot[1], 0.0]]))[0]
-        yaw = geometry.yaw_of(solution.T[:3, :3])
-        pose = Pose(yaw, float(place[0]), float(place[1]), pose.score, pose.overlap_cells)
-    rescored = score_nearby(source, target, pose, 1)[0]
-    if rescored.score < candidate.pose.score:
-        # patches that do not agree must not carry a good hypothesis away
-        rescored = candidate.pose
-        patches = match_patches(source, target, rescored, window=max(3, window // 2), stride=stride)
-        s, t = source.grid.to_metres(patches.source_px), target.grid.to_metres(patches.target_px)
-        _, supporting = ransac_upright(s, t, 1.5 * cell, seed, 500)
-    assert patches is not None
-    return Candidate(rescored, candidate.proposed, patches, supporting)
+    pose = candidate.pose
+    reach = max(REACH_CELLS, round(settings.reach_m / cell))
+    patches = match_patches(source, target, pose, window=reach, stride=stride)
+    corrected = _corrected(pose, patches, _vote(patches, source, target, seed), source, target)
+    rescored = score_nearby(source, target, corrected, 1)[0]
+    # patches that do not agree must not carry a good hypothesis away
+    if rescored.score >= pose.score:
+        pose = rescored
+    patches = match_patches(source, target, pose, window=REACH_CELLS, stride=stride)
+    return Candidate(pose, candidate.proposed, patches, _vote(patches, source, target, seed))
+
+
+def _vote(patches: PatchMatches, source: Layer, target: Layer, seed: int) -> NDArray[np.bool_]:
+    """Mark the patches that agree on one yaw and shift."""
+    s, t = source.grid.to_metres(patches.source_px), target.grid.to_metres(patches.target_px)
+    return ransac_upright(s, t, AGREE_CELLS * source.grid.cell, seed, 500)[1]
+
+
+def _corrected(
+    pose: Pose, patches: PatchMatches, supporting: NDArray[np.bool_], source: Layer, target: Layer
+) -> Pose:
+    """Fit yaw and shift to the patches, starting from those that agree."""
+    if supporting.sum() < 4:
+        return pose
+    flat = np.zeros((len(patches), 1))
+    solution = iterative_svd(
+        np.hstack([source.grid.to_metres(patches.source_px), flat]),
+        np.hstack([target.grid.to_metres(patches.target_px), flat]),
+        start=supporting,
+        weight=patches.score**2,
+        floor=AGREE_CELLS * source.grid.cell,
+        upright=True,
+    )
+    east, north = geometry.apply(solution.T, np.array([[*centre_of(source.grid), 0.0]]))[0, :2]
+    return Pose(
+        geometry.yaw_of(solution.T[:3, :3]), float(east), float(north), pose.score, pose.overlap_cells
+    )

@@ -1,0 +1,146 @@
+"""What speaks for a result: gathered from a solved pair, to be judged by `assess`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mtpcr_geo import geometry
+from mtpcr_geo.assess import Evidence
+from mtpcr_geo.chance import chance_within
+from mtpcr_geo.errors import RegistrationError
+from mtpcr_geo.overlap import overlap_of
+from mtpcr_geo.scene import Floats, Pair, Ties
+from mtpcr_geo.solve import solve_ties
+
+GROUND_AGREES_M = 0.5
+TIES_A_PATCH = 4
+"""Patches overlap by half, so about four ties tell what one independent tie would."""
+
+
+def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[str, Any]]:
+    """Gather the evidence for a pair's transform.
+
+    Args:
+        pair: solved, with rasters and ties.
+        tolerance: plan distance within which a withheld tie agrees, metres; one cell if None.
+
+    Returns:
+        The evidence, and further metrics: pose, uncertainty and tie residuals.
+
+    """
+    assert pair.T_target_source is not None
+    assert pair.ties is not None
+    cell = pair.source.bev.grid.cell if pair.source.bev is not None else 1.0
+    tolerance = tolerance or max(cell, 1.0)
+    T = pair.T_target_source
+    ties = pair.ties
+    T_level = pair.target.T_level_work @ T @ geometry.inverse(pair.source.T_level_work)
+    residual = np.hypot(*(geometry.apply(T_level, ties.source) - ties.target)[:, :2].T)
+    withheld = cross_validated(ties, tolerance, pair.solve_report)
+    agreeing = withheld < tolerance
+    matched = pair.matches.report if pair.matches is not None else {}
+    moved = geometry.apply(T, pair.source.sample)
+    overlap = overlap_of(moved, pair.target.sample)
+    _, steps = overlap.ground_steps()
+    evidence = Evidence(
+        withheld=len(withheld),
+        withheld_agreeing=int(agreeing.sum()),
+        chance=chance_within(tolerance, matched["reach_m"]) if "reach_m" in matched else None,
+        tolerance_m=tolerance,
+        withheld_median_m=float(np.median(withheld[agreeing])) if agreeing.any() else None,
+        margin=matched.get("margin"),
+        support=matched.get("support"),
+        overlap_m2=overlap.area_m2,
+        overlap_source=float(overlap.select(moved).mean()),
+        overlap_target=float(overlap.select(pair.target.sample).mean()),
+        ground_cells=len(steps),
+        ground_agreeing=int((np.abs(steps) < GROUND_AGREES_M).sum()),
+        refined_away_m=_refined_away(pair, T),
+    )
+    shift = T[:3, 3]
+    more = {
+        "yaw_deg": float(np.degrees(geometry.yaw_of(T[:3, :3]))),
+        "tilt_deg": float(np.degrees(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))),
+        "shift_work_m": [float(v) for v in shift],
+        "ties": len(ties.score),
+        "ties_agreeing": int((residual < tolerance).sum()),
+        **_uncertainty(
+            ties,
+            residual,
+            tolerance,
+            geometry.apply(T_level, pair.source.levelled_sample.mean(axis=0)[None])[0],
+        ),
+    }
+    return evidence, more
+
+
+def cross_validated(ties: Ties, tolerance: float, solved: dict[str, Any]) -> Floats:
+    """Withhold each fold in turn, solve from the others, and give every tie's plan residual while withheld.
+
+    Args:
+        ties: ties with folds.
+        tolerance: as given to the solver, metres.
+        solved: the solver's report, for the settings it ran with.
+
+    Returns:
+        (n,) metres; infinite where the others gave no transform.
+
+    """
+    residual = np.full(len(ties.score), np.inf)
+    for fold in np.unique(ties.fold):
+        out = ties.fold == fold
+        try:
+            solution, _ = solve_ties(
+                ties.source,
+                ties.target,
+                ties.score,
+                out,
+                tolerance=1.5 * tolerance,
+                **solved.get("settings", {}),
+            )
+        except RegistrationError:
+            continue
+        gap = geometry.apply(solution.T, ties.source[out]) - ties.target[out]
+        residual[out] = np.hypot(gap[:, 0], gap[:, 1])
+    return residual
+
+
+def _refined_away(pair: Pair, T: Floats) -> float:
+    before = pair.refine_report.get("T_before")
+    if before is None or pair.ties is None or not len(pair.ties.source):
+        return 0.0
+    middle = geometry.apply(
+        geometry.inverse(pair.source.T_level_work), pair.ties.source.mean(axis=0, keepdims=True)
+    )
+    return float(np.linalg.norm(geometry.apply(T, middle) - geometry.apply(before, middle)))
+
+
+def _uncertainty(ties: Ties, residual: Floats, tolerance: float, centroid: Floats) -> dict[str, Any]:
+    """One standard deviation of yaw and plan position, from the scatter and spread of the ties.
+
+    Args:
+        ties: all ties.
+        residual: (n,) their plan residuals, metres.
+        tolerance: within which a tie agrees, metres.
+        centroid: (3,) where the source's centroid comes to lie, in the target's levelled frame.
+
+    """
+    near = residual < 2.5 * tolerance
+    if near.sum() < 6:
+        return {"sigma_yaw_deg": None, "sigma_plan_m": None, "sigma_plan_source_centroid_m": None}
+    xy = ties.target[near, :2]
+    # a Rayleigh median is 1.1774 standard deviations of one coordinate
+    scatter = float(np.median(residual[near])) / 1.1774
+    independent = max(float(near.sum()) / TIES_A_PATCH, 1.5)
+    middle = xy.mean(axis=0)
+    arm = max(float(np.sqrt(((xy - middle) ** 2).sum(axis=1).mean())), 1.0)
+    plan = scatter / np.sqrt(independent)
+    yaw = plan / arm
+    lever = float(np.linalg.norm(centroid[:2] - middle))
+    return {
+        "sigma_yaw_deg": float(np.degrees(yaw)),
+        "sigma_plan_m": float(plan),
+        "sigma_plan_source_centroid_m": float(np.hypot(plan, yaw * lever)),
+    }
