@@ -176,8 +176,13 @@ def matches_picture(pair: Pair, max_side: int = 1400, most: int = 150) -> Pictur
     import cv2
 
     picture, ends, colours, kind = match_lines(pair)
-    scale = min(1.0, max_side / max(picture.shape[:2]))
-    small = fit(picture, max_side)
+    scale = max_side / max(picture.shape[:2])
+    if scale >= 2.0:
+        scale = float(int(scale))
+        small = picture.repeat(int(scale), axis=0).repeat(int(scale), axis=1)
+    else:
+        scale = min(1.0, scale)
+        small = fit(picture, max_side)
     small = np.ascontiguousarray((small.astype(np.float32) * 0.75).astype(np.uint8))
     order = np.argsort(kind != 0, kind="stable")  # outliers first, so that inliers lie on top
     order = order[np.linspace(0, len(order) - 1, min(most, len(order))).astype(int)] if len(order) else order
