@@ -8,7 +8,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import laspy
 import lazrs
@@ -146,12 +146,28 @@ def open_cloud(path: str | Path, crs: CRS | None = None) -> LasCloud:
     with _reported(path), path.open("rb") as stream:
         if stream.read(4) != b"LASF":
             raise InputError(f"{path} is not a LAS, LAZ or COPC file (it does not begin with LASF)")
+        _check_head(stream)
         stream.seek(0)
         header = laspy.LasHeader.read_from(stream)
         records = _records(stream, header)
         header.point_format.dtype()  # two dimensions of one name show here
         _check_size(path, header)
+        _check_chunk_table(stream, header, records)
     return LasCloud(path, header, records, crs)
+
+
+def _check_head(stream: BinaryIO) -> None:
+    """Check the counts at the head of the file before anything reads as much as they say.
+
+    Raises:
+        ValueError: if the file cannot hold what they promise.
+
+    """
+    size = stream.seek(0, 2)
+    stream.seek(94)
+    header_size, points, records = struct.unpack("<HII", stream.read(10))
+    if not 227 <= header_size <= points <= size or records * 54 > points - header_size:
+        raise ValueError("its header contradicts its size")
 
 
 def _records(stream: Any, header: laspy.LasHeader) -> list[Record]:
@@ -169,6 +185,42 @@ def _check_size(path: Path, header: laspy.LasHeader) -> None:
     wanted = header.offset_to_point_data + header.point_count * header.point_format.size
     if path.stat().st_size < wanted:
         raise ValueError(f"it holds {path.stat().st_size} bytes where its header promises {wanted}")
+
+
+def _check_chunk_table(stream: BinaryIO, header: laspy.LasHeader, records: list[Record]) -> None:
+    """Check what says where the compressed chunks lie: lazrs ends the whole process on absurd sizes.
+
+    Raises:
+        ValueError: if the table contradicts the file.
+
+    """
+    if not (header.are_points_compressed and header.point_count):
+        return
+    described = [record.data for record in records if record.user_id == "laszip encoded"]
+    if not described:
+        raise ValueError("the record that describes its compression is missing")
+    vlr = lazrs.LazVlr(described[0])
+    if vlr.item_size() != header.point_format.size:
+        raise ValueError("its points and their compression have different sizes")
+    size = stream.seek(0, 2)
+    start = header.offset_to_point_data
+    stream.seek(start)
+    (table,) = struct.unpack("<q", stream.read(8))
+    if table == -1:
+        stream.seek(size - 8)
+        (table,) = struct.unpack("<q", stream.read(8))
+    if not start + 8 <= table <= size - 8:
+        raise ValueError("the table of its compressed chunks is missing")
+    stream.seek(table + 4)
+    (chunks,) = struct.unpack("<I", stream.read(4))
+    if chunks > table - start:
+        raise ValueError("the table of its compressed chunks makes no sense")
+    stream.seek(start)
+    entries = lazrs.read_chunk_table(stream, vlr)
+    fits = sum(length for _, length in entries) <= table - start
+    # with chunks of one size, the table promises full ones, the last one too
+    if not fits or sum(points for points, _ in entries) < header.point_count:
+        raise ValueError("the table of its compressed chunks does not fit its header")
 
 
 @contextmanager

@@ -117,15 +117,33 @@ def returning_scales(cloud: Cloud, crs: CRS | None) -> Floats:
 
 
 def _write_las(path: Path, header: laspy.LasHeader, chunks: Iterator[NDArray[Any]]) -> None:
+    compress = path.suffix.lower() == ".laz"
+    if compress and header.point_format.has_waveform_packet:
+        chunks = _of_one_channel(chunks)
     # the first chunk settles the offsets, which the header needs before anything is written
     first = next(chunks, None)
-    with laspy.open(path, mode="w", header=header, do_compress=path.suffix.lower() == ".laz") as writer:
+    with laspy.open(path, mode="w", header=header, do_compress=compress) as writer:
         if first is not None:
             writer.write_points(laspy.PackedPointRecord(first, header.point_format))
         for chunk in chunks:
             writer.write_points(laspy.PackedPointRecord(chunk, header.point_format))
         if header.evlrs:
             writer.write_evlrs(header.evlrs)
+
+
+def _of_one_channel(chunks: Iterator[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+    """Pass on points with waveforms, unless their scanner channels are mixed.
+
+    lazrs up to 0.8 garbles the wave packets of such points without a word.
+    """
+    seen: set[int] = set()
+    for chunk in chunks:
+        seen |= set(np.unique(chunk["classification_flags"] >> 4 & 3).tolist())
+        if len(seen) > 1:
+            raise OutputError(
+                "waveforms of several scanner channels cannot be compressed reliably; name the output .las"
+            )
+        yield chunk
 
 
 def _scales(cloud: Cloud, crs: CRS | None, said: float | tuple[float, float, float] | None) -> Floats:
