@@ -51,7 +51,7 @@ def axis_angle_matrix(axis: Points, angle: float) -> Matrix:
     """Rotate by ``angle`` radians about a unit ``axis`` (3,), by Rodrigues' formula: (3, 3)."""
     x, y, z = axis
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K)
+    return np.asarray(np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K))
 
 
 def about(pivot: Points, R: Matrix) -> Matrix:

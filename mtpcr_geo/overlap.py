@@ -48,8 +48,9 @@ class Overlap:
         """Tell which (n, 3) points lie in the overlap."""
         pixel = np.round(self.grid.to_pixel(xyz[:, :2])).astype(int)
         inside = ((pixel >= 0) & (pixel < [self.grid.width, self.grid.height])).all(axis=1)
-        column, row = np.where(inside[:, None], pixel, 0).T
-        return np.asarray(inside & self.shared[row, column])
+        found = np.zeros(len(xyz), bool)
+        found[inside] = self.shared[pixel[inside, 1], pixel[inside, 0]]
+        return found
 
     def ground_steps(self) -> tuple[Floats, Floats]:
         """Compare lowest heights where both look at the ground.

@@ -151,7 +151,7 @@ def _at_most(cloud: Any, most: int) -> Floats:
 
 
 def reaches_for(cell: float) -> tuple[float, ...]:
-    """Choose the rounds' reaches for clouds rasterised at ``cell`` metres: 3 m, halved down to the spacing."""
+    """Choose the rounds' reaches for clouds rasterised at ``cell`` metres: 3 m, halved to the spacing."""
     reaches = [FIRST_REACH_M]
     while reaches[-1] / 2 >= 0.75 * cell:
         reaches.append(reaches[-1] / 2)

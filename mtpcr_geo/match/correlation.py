@@ -268,9 +268,8 @@ def _distinct(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _same(a: Pose, b: Pose) -> bool:
-    return (
-        angle_between(a.yaw, b.yaw) < np.radians(5.0) and np.hypot(a.east - b.east, a.north - b.north) < 12.0
-    )
+    apart = float(np.hypot(a.east - b.east, a.north - b.north))
+    return angle_between(a.yaw, b.yaw) < np.radians(5.0) and apart < 12.0
 
 
 def _judge_by_patches(

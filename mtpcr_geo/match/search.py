@@ -202,14 +202,14 @@ def score_nearby(source: Layer, target: Layer, pose: Pose, window: int) -> tuple
             sums[:, dy, dx] = (m @ M, a @ A, e @ E, aa @ M, ee @ M, mA @ A, mE @ E)
     overlap = sums[0]
     score = correlation_score(overlap, (sums[1], sums[2]), (sums[3], sums[4]), (sums[5], sums[6]))
-    dy, dx = np.unravel_index(int(np.argmax(score)), score.shape)
+    best_dy, best_dx = divmod(int(np.argmax(score)), side)
     cell = target.grid.cell
     best = Pose(
         pose.yaw,
-        pose.east + (int(dx) - window) * cell,
-        pose.north - (int(dy) - window) * cell,
-        float(score[dy, dx]),
-        round(float(overlap[dy, dx])),
+        pose.east + (best_dx - window) * cell,
+        pose.north - (best_dy - window) * cell,
+        float(score[best_dy, best_dx]),
+        round(float(overlap[best_dy, best_dx])),
     )
     return best, score
 

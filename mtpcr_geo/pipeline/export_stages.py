@@ -238,7 +238,7 @@ class WriteRun(EvidenceWriter):
 
         pair = next((given for given in inputs if isinstance(given, Pair)), None)
         path = context.outputs.path(self.options.filename)
-        write_run_json(path, pair, run_facts(pair, context))
+        write_run_json(path, run_facts(pair, context))
         return pair
 
 
