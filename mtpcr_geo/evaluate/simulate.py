@@ -143,7 +143,7 @@ def simulate_pair(
     high = instruments.measure(caster, fly(block, site.ground.height, air_density, chance), how, chance)
     high = high.part(block.contains(high.xyz[:, :2]))
 
-    T_target_site, T_source_site = _frames(path, site, tilt_deg, chance)
+    T_target_site, T_source_site = _frames(path, site, tilt_deg, np.random.default_rng([seed, 29]))
     shares = near_shares(occupied_cells(low.xyz), occupied_cells(high.xyz))
     from pyproj import CRS
 

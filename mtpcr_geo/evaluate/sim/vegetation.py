@@ -1,8 +1,8 @@
 """Trees, shrubs and hedges as leaves in clumps, so that beams pass partly through them.
 
-A plant is a template (a few hundred leaf triangles about a unit crown, drawn once per species and
-variant) set into the site with its own height, breadth and turn. In another epoch the same plants
-are drawn with other variants and slightly other sizes: no leaf is where it was.
+A plant is a template (limbs, and a few hundred leaf triangles about them) set into the site with its
+own height, breadth and turn. In another epoch a plant keeps its limbs, breadth, turn and lean, but has
+other leaves and a slightly other size: no leaf is where it was, the crown's outline about is.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from mtpcr_geo.evaluate.sim.mesh import Material, MeshBuilder
 
 Floats = NDArray[np.float64]
-VARIANTS = 5
+VARIANTS = 6
+_KEYS = 100_003
 
 
 class Species(IntEnum):
@@ -98,16 +99,16 @@ class Plants:
         )
 
 
-def _template(form: Form, rng: np.random.Generator) -> Floats:
+def _template(form: Form, limbs: np.random.Generator, rng: np.random.Generator) -> Floats:
     """Leaves (m, 3, 6) of a unit crown: by corner, the leaf's place in the crown and the corner's offset."""
     k = form.clumps
-    direction = rng.normal(size=(k, 3))
+    direction = limbs.normal(size=(k, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    centre = direction * (rng.uniform(0.35, 0.8, (k, 1)) * rng.uniform(0.85, 1.1, (k, 1)))
+    centre = direction * (limbs.uniform(0.35, 0.8, (k, 1)) * limbs.uniform(0.85, 1.1, (k, 1)))
     up = 0.5 * (centre[:, 2] + 1)  # 0 at the crown's foot, 1 at its top
     narrow = 1 - form.taper * np.clip(up, 0, 1)
     centre[:, :2] *= (narrow + 0.05)[:, None]
-    radius = form.clump * rng.uniform(0.6, 1.25, k) * (0.35 + 0.65 * narrow)
+    radius = form.clump * limbs.uniform(0.6, 1.25, k) * (0.35 + 0.65 * narrow)
     shell = rng.normal(size=(k, form.leaves, 3))
     shell /= np.linalg.norm(shell, axis=2, keepdims=True)
     shell[..., 2] = np.abs(shell[..., 2]) * rng.choice([1, 1, -1], size=shell.shape[:2])
@@ -137,25 +138,22 @@ def add_plants(
         ground_z: (n,) metres, the ground at each plant.
         rng: chance of this epoch.
         leafiness: share of leaves present; about 0.25 for bare winter trees (twigs).
-        shape_seed: seed of what is the same in all epochs: each crown's breadth.
+        shape_seed: seed of what is the same in all epochs: limbs, breadth, turn and lean.
 
     """
-    breadth = np.random.default_rng(shape_seed).uniform(0.8, 1.25, 100_003)
+    # what a plant keeps is drawn by a key from its place, so that it stays when others are felled
+    table = np.random.default_rng([shape_seed, 41]).uniform(0, 1, (_KEYS, 5))
+    kept = table[(np.abs(plants.xy * [7919.0, 104729.0]).sum(axis=1)).astype(np.int64) % _KEYS]
     for species, form in FORMS.items():
-        index = np.flatnonzero(plants.species == species)
-        if not len(index):
-            continue
-        variant = rng.integers(0, VARIANTS, len(index))
         for v in range(VARIANTS):
-            template = _template(form, rng)
-            chosen = index[variant == v]
+            chosen = np.flatnonzero((plants.species == species) & (np.floor(kept[:, 0] * VARIANTS) == v))
+            limbs = np.random.default_rng([shape_seed, int(species), v])
+            template = _template(form, limbs, rng)
             if len(chosen):
-                xy = plants.xy[chosen]
-                # a key from the place, so that a plant keeps its shape when others are felled
-                key = (np.abs(xy * [7919.0, 104729.0]).sum(axis=1)).astype(np.int64) % 100_003
-                _place(out, template, form, plants, chosen, ground_z, breadth[key], rng, leafiness)
+                _place(out, template, form, plants, chosen, ground_z, kept[chosen], rng, leafiness)
     tall = np.flatnonzero(plants.species != Species.SHRUB)
-    _trunks(out, plants.xy[tall], plants.height[tall], ground_z[tall], rng)
+    lean = 0.03 * (kept[tall, 3:5] - 0.5) * plants.height[tall, None]
+    _trunks(out, plants.xy[tall], plants.height[tall], ground_z[tall], lean)
 
 
 def _place(
@@ -165,15 +163,15 @@ def _place(
     plants: Plants,
     chosen: NDArray[np.int64],
     ground_z: Floats,
-    breadth: Floats,
+    kept: Floats,
     rng: np.random.Generator,
     leafiness: float,
 ) -> None:
-    n, m = len(chosen), len(template)
+    m = len(template)
     height = plants.height[chosen]
-    radius = 0.5 * form.breadth * height * breadth
+    radius = 0.5 * form.breadth * height * (0.8 + 0.45 * kept[:, 1])
     half = 0.5 * (1 - form.crown_base) * height
-    turn = rng.uniform(0, 2 * np.pi, n)
+    turn = 2 * np.pi * kept[:, 2]
     c, s = np.cos(turn)[:, None, None], np.sin(turn)[:, None, None]
     centre = template[None, :, :, :3]
     x = radius[:, None, None] * (c * centre[..., 0] - s * centre[..., 1])
@@ -190,11 +188,10 @@ def _place(
     out.polygons(leaves, Material.LEAF)
 
 
-def _trunks(out: MeshBuilder, xy: Floats, height: Floats, ground_z: Floats, rng: np.random.Generator) -> None:
+def _trunks(out: MeshBuilder, xy: Floats, height: Floats, ground_z: Floats, lean: Floats) -> None:
     n = len(xy)
     if not n:
         return
-    lean = rng.normal(0, 0.015, (n, 2)) * height[:, None]
     r = 0.011 * height + 0.03
     angle = 2 * np.pi * np.arange(5) / 5
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
