@@ -106,9 +106,6 @@ def print_outcome(result: RunResult | None, *, as_json: bool, verbose: bool, qui
 
 
 def _json(value: Any) -> str:
-    return json.dumps(value, indent=2, default=_plain)
+    from mtpcr_geo.export.run_json import plain
 
-
-def _plain(value: Any) -> Any:
-    """Turn numpy's values and paths into JSON's."""
-    return value.tolist() if hasattr(value, "tolist") else str(value)
+    return json.dumps(plain(value), indent=2, allow_nan=False)

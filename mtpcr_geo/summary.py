@@ -17,6 +17,18 @@ if TYPE_CHECKING:
     from mtpcr_geo.register import Registration
 
 _COLOUR = {"accepted": "bold green", "doubtful": "bold yellow", "refused": "bold red"}
+# the numbers most worth a look; --verbose shows all
+_SHOWN = (
+    "overlap_m2",
+    "overlap_source",
+    "overlap_target",
+    "withheld_agreeing_share",
+    "withheld_median_m",
+    "hypothesis_margin",
+    "sigma_yaw_deg",
+    "sigma_plan_source_centroid_m",
+    "sigma_height_m",
+)
 _OPEN_WITH = {
     "registered": "the moved cloud",
     "report": "the report, in any browser",
@@ -36,7 +48,7 @@ def print_registration(console: Console, result: Registration, *, verbose: bool 
     for reason in result.verdict.reasons:
         console.print(Text(f"  {reason}"), soft_wrap=True)
     facts = Table(box=None, show_header=False, pad_edge=True, padding=(0, 1))
-    for label, value in (*_transform_rows(result), *_metric_rows(result.verdict.metrics)):
+    for label, value in (*_transform_rows(result), *_metric_rows(result.verdict.metrics, verbose)):
         facts.add_row(label, value)
     if facts.row_count:
         console.print(facts)
@@ -80,16 +92,11 @@ def _transform_rows(result: Registration) -> list[tuple[str, str]]:
     ]
 
 
-def _metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    return [(key.replace("_", " "), _number(value)) for key, value in metrics.items() if _is_plain(value)]
+def _metric_rows(metrics: Mapping[str, Any], verbose: bool) -> list[tuple[str, str]]:
+    from mtpcr_geo.export.story import metric_rows
 
-
-def _is_plain(value: Any) -> bool:
-    return isinstance(value, int | float | str) and not isinstance(value, bool)
-
-
-def _number(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    chosen = {key: metrics[key] for key in _SHOWN if metrics.get(key) is not None}
+    return metric_rows(metrics if verbose or not chosen else chosen)
 
 
 def _print_stages(console: Console, done: Sequence[Mapping[str, Any]]) -> None:

@@ -117,7 +117,7 @@ def write_pdal_pipeline(path: str | Path, pair: Pair) -> None:
         "type": "writers.las",
         "filename": f"{Path(source_name).stem}_registered.laz",
         "minor_version": 4,
-        "forward": "vlr,gps_time,global_encoding",
+        "forward": "vlr,global_encoding",
         "extra_dims": "all",
         "offset_x": "auto",
         "offset_y": "auto",

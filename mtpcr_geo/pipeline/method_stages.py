@@ -52,9 +52,13 @@ class Level(Stage):
 
     def check_inputs(self, inputs: Sequence[Value], context: RunContext) -> None:
         """Settle the frames from the headers, so that a CRS that does not do is known before the run."""
+        from mtpcr_geo.cloud.las import check_distinct
+
         clouds = [value for value in inputs if isinstance(value, Cloud)]
         if len(clouds) in (1, 2) and all(cloud.count for cloud in clouds):
             self._frames(clouds[0], clouds[-1])
+        if len(clouds) == 2:
+            check_distinct(*clouds)
 
     def _frames(self, target: Cloud, source: Cloud):  # type: ignore[no-untyped-def]
         from mtpcr_geo.crs import resolve_frames
@@ -69,6 +73,7 @@ class Level(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Scan, sample and level each cloud."""
+        from mtpcr_geo.cloud.las import check_distinct
         from mtpcr_geo.cloud.sample import scan
         from mtpcr_geo.level import level
 
@@ -76,6 +81,8 @@ class Level(Stage):
         if len(clouds) != len(inputs) or len(clouds) not in (1, 2):
             raise OptionError(f"{self.label} takes two clouds, the fixed one first, or one; set its inputs")
         target, source = clouds[0], clouds[-1]
+        if len(clouds) == 2:
+            check_distinct(target, source)
         options = self.options
         found = [
             scan(cloud, budget=options.budget, seed=options.seed, progress=context.progress)
