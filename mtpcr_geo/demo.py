@@ -116,7 +116,7 @@ def simulate_town(seed: int) -> SimulatedPair:
 
 def _summary(pair: SimulatedPair, registration: Registration, errors: PoseErrors | None, folder: Path) -> str:
     lines = [
-        f"Simulated: {pair.description}.",
+        f"{pair.description.capitalize()}.",
         f"The clouds share {pair.overlap_source:.0%} of the ground cloud's cells and "
         f"{pair.overlap_target:.0%} of the aerial one's; the ground cloud is tilted by "
         f"{pair.options['tilt_deg']:.1f} degrees, turned and shifted.",
