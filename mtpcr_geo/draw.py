@@ -196,16 +196,16 @@ def matches_picture(pair: Pair, max_side: int = 1400, most: int = 150) -> Pictur
     return small
 
 
-def common_rasters(pair: Pair, margin_m: float = 10.0, max_side: int = 1600) -> tuple[Bev, Bev]:
-    """Resample both BEVs onto one grid around the registered source, in levelled target coordinates.
+def common_rasters(pair: Pair, margin_m: float = 15.0, max_side: int = 1600) -> tuple[Bev, Bev]:
+    """Resample both BEVs onto one grid where they overlap, in levelled target coordinates.
 
     Args:
         pair: with BEVs and a transform.
-        margin_m: how far around the source to look, metres.
+        margin_m: how far around the overlap to look, metres.
         max_side: cells that the grid may have along its longer side; larger ones get coarser cells.
 
     Returns:
-        (source, target) on the same grid.
+        (source, target) on the same grid; the whole source where nothing overlaps.
 
     Raises:
         ValueError: if the pair has no BEVs or no transform yet.
@@ -215,14 +215,31 @@ def common_rasters(pair: Pair, margin_m: float = 10.0, max_side: int = 1600) -> 
     if source is None or target is None or pair.T_target_source is None:
         raise ValueError("an overlay needs both BEVs and a transform")
     T = pair.target.T_level_work @ pair.T_target_source @ geometry.inverse(pair.source.T_level_work)
-    around = grid_around(source, T)
+    whole = grid_around(source, T)
+    step = max(1.0, max(whole.shape) / 300.0)
+    rough = _regrid(whole, 0.0, whole.cell * step)
+    both = np.isfinite(warp_bev(source, T, rough).top)
+    both &= np.isfinite(warp_bev(target, np.eye(4), rough).top)
+    grid = _crop(rough, both) if both.any() else rough
     cell = max(target.grid.cell, source.grid.cell)
-    cell *= max(1.0, (max(around.width, around.height) * around.cell + 2 * margin_m) / cell / max_side)
-    low_east, high_north = around.west - margin_m, around.north + margin_m
-    width = int(np.ceil((around.width * around.cell + 2 * margin_m) / cell))
-    height = int(np.ceil((around.height * around.cell + 2 * margin_m) / cell))
-    grid = Grid(float(low_east), float(high_north), cell, width, height)
+    longest = max(grid.shape) * grid.cell + 2 * margin_m
+    grid = _regrid(grid, margin_m, cell * max(1.0, longest / cell / max_side))
     return warp_bev(source, T, grid), warp_bev(target, np.eye(4), grid)
+
+
+def _crop(grid: Grid, mask: NDArray[np.bool_]) -> Grid:
+    """Cut a grid down to the rows and columns in which a mask holds."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    west = grid.west + float(columns[0]) * grid.cell
+    north = grid.north - float(rows[0]) * grid.cell
+    return Grid(west, north, grid.cell, int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1)
+
+
+def _regrid(grid: Grid, margin_m: float, cell: float) -> Grid:
+    """Cover a grid's extent and a margin around it with cells of another size."""
+    width = int(np.ceil((grid.width * grid.cell + 2 * margin_m) / cell))
+    height = int(np.ceil((grid.height * grid.cell + 2 * margin_m) / cell))
+    return Grid(float(grid.west) - margin_m, float(grid.north) + margin_m, cell, width, height)
 
 
 def edge_overlay(source: Bev, target: Bev) -> Picture:

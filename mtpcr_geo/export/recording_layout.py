@@ -126,9 +126,7 @@ def _ties(recorded: Recorded) -> Any:
 
     if not recorded.has("aligned/ties"):
         return None
-    space = _space(
-        recorded, "aligned", "Ties by misfit: green fits, red does not", hide=("source", "links"), plain=True
-    )
+    space = _space(recorded, "aligned", "Ties by misfit: green fits, red does not", hide=("source", "links"))
     chart = rrb.BarChartView(origin="residuals", name="Ties by misfit in centimetres")
     return rrb.Vertical(space, chart, row_shares=[3, 1], name="Ties")
 
@@ -137,7 +135,7 @@ def _inputs(recorded: Recorded) -> Any:
     import rerun.blueprint as rrb
 
     views = [
-        _space(recorded, f"input/{role}", f"{role.capitalize()} as read, by height")
+        _space(recorded, f"input/{role}", f"{role.capitalize()} as read, by height", away=1.5)
         for role in ("source", "target")
         if recorded.has(f"input/{role}")
     ]
@@ -150,9 +148,7 @@ def _map(recorded: Recorded) -> Any:
     return rrb.MapView(origin="map", name="Map") if recorded.has("map") else None
 
 
-def _space(
-    recorded: Recorded, origin: str, name: str, hide: tuple[str, ...] = (), plain: bool = False
-) -> Any:
+def _space(recorded: Recorded, origin: str, name: str, hide: tuple[str, ...] = (), away: float = 1.0) -> Any:
     """Give a 3D view that looks from the south, half from above, at all that is there."""
     import rerun.blueprint as rrb
 
@@ -164,13 +160,17 @@ def _space(
         reach = float(np.linalg.norm(bounds[1, :2] - bounds[0, :2])) or 10.0
         eye = rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=middle + reach * np.array([0.0, -0.55, 0.6]),
+            position=middle + away * reach * np.array([0.0, -0.46, 0.5]),
             look_target=middle - reach * np.array([0.0, 0.03, 0.0]),
             eye_up=(0.0, 0.0, 1.0),
         )
-    background = (18, 20, 24) if not plain else (12, 13, 16)
     return rrb.Spatial3DView(
-        origin=origin, contents=contents, name=name, background=background, line_grid=False, eye_controls=eye
+        origin=origin,
+        contents=contents,
+        name=name,
+        background=(18, 20, 24),
+        line_grid=False,
+        eye_controls=eye,
     )
 
 

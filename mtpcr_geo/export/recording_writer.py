@@ -76,12 +76,13 @@ class RecordingWriter:
         self._stream.set_time(TIMELINE, sequence=self._stage)
         self._stages.append((tag, stage_type, seconds))
         self._options[tag] = options
+        made = _made(value, self._pair)
         if isinstance(value, Pair):
             self._log_pair(value)
         level = rr.TextLogLevel.INFO
         if isinstance(value, Pair) and value.verdict is not None and value.verdict.name != "accepted":
             level = rr.TextLogLevel.WARN
-        line = f"{tag} ({stage_type}), {seconds:.2f} s: {_made(value)}"
+        line = f"{tag} ({stage_type}), {seconds:.2f} s: {made}"
         self._log("stages", rr.TextLog(line, level=level))
         self._log("seconds", rr.Scalars(seconds))
         self._log("summary", self._markdown(self._summary()))
@@ -162,7 +163,7 @@ class RecordingWriter:
         if not pair.matches.hypotheses:
             return
         scores = np.array([one.score for one in pair.matches.hypotheses], np.float64)
-        ranks = np.arange(1, len(scores) + 1, dtype=np.float64)
+        ranks = np.arange(len(scores), dtype=np.float64) + 0.5  # a bar's left edge
         self._log("hypotheses/scores", rr.BarChart(scores, abscissa=ranks, color=draw.UNJUDGED_RGB))
         head = ("rank", "yaw", "shift", "score", "overlap")
         self._log("hypotheses/table", self._markdown(story.markdown_table(head, story.hypothesis_rows(pair))))
@@ -227,11 +228,9 @@ class RecordingWriter:
         self._log("aligned/ties", values)
         top = max(float(np.percentile(residual, 95)), 0.05)
         counts, edges = np.histogram(np.clip(residual, 0.0, top), bins=30, range=(0.0, top))
-        centimetres = 50.0 * (edges[1:] + edges[:-1])
+        left_cm = 100.0 * edges[:-1]
         widths = np.full(len(counts), 100.0 * (edges[1] - edges[0]), np.float32)
-        chart = rr.BarChart(
-            counts.astype(np.float64), abscissa=centimetres, widths=widths, color=draw.GOOD_RGB
-        )
+        chart = rr.BarChart(counts.astype(np.float64), abscissa=left_cm, widths=widths, color=draw.GOOD_RGB)
         self._log("residuals", chart)
 
     def _log_map(self, pair: Pair) -> None:
@@ -310,13 +309,15 @@ class RecordingWriter:
         if pair is not None:
             rows = story.transform_rows(pair)
             if rows:
-                parts.append("## Transform\n\n" + story.markdown_table(("", ""), rows))
+                parts.append("## Transform\n\n" + story.markdown_table(("what", "value"), rows))
             if pair.verdict is not None and pair.verdict.metrics:
                 table = story.markdown_table(("check", "value"), story.metric_rows(pair.verdict.metrics))
                 parts.append("## Checks\n\n" + table)
             for side in [pair.target] if pair.source is pair.target else [pair.source, pair.target]:
                 if self._new(f"rows {side.role}", side):
-                    self._side_texts[side.role] = story.markdown_table(("", ""), story.side_rows(side))
+                    self._side_texts[side.role] = story.markdown_table(
+                        ("what", "value"), story.side_rows(side)
+                    )
                 parts.append(f"## {side.role.capitalize()}\n\n{self._side_texts[side.role]}")
         rows = [(tag, f"{seconds:.2f} s") for tag, _, seconds in self._stages]
         parts.append("## Time\n\n" + story.markdown_table(("stage", "time"), rows))
@@ -331,30 +332,32 @@ class RecordingWriter:
             value = self._properties.get(name)
             if isinstance(value, Mapping):
                 rows = [(str(key), story.plain(one)) for key, one in value.items()]
-                parts.append(f"## {name.capitalize()}\n\n" + story.markdown_table(("", ""), rows))
+                parts.append(f"## {name.capitalize()}\n\n" + story.markdown_table(("what", "value"), rows))
             elif isinstance(value, list):
                 parts.append(f"## {name.capitalize()}\n\n" + "\n".join(f"- {story.plain(v)}" for v in value))
         return "\n\n".join(parts) or "nothing was noted"
 
 
-def _made(value: object) -> str:
-    """Say in some words what a stage made."""
+def _made(value: object, before: Pair | None) -> str:
+    """Say in some words what a stage newly made."""
     if isinstance(value, Cloud):
         return f"a cloud of {value.count:,} points, {Path(value.name).name}"
     if not isinstance(value, Pair):
         return "done"
+    if before is None:
+        return "both clouds in their work frames"
     found = []
-    if value.matches is not None:
+    if value.target.bev is not None and value.target.bev is not before.target.bev:
+        found.append(f"rasters of {value.target.bev.grid.cell:g} m cells")
+    if value.matches is not None and value.matches is not before.matches:
         found.append(f"{len(value.matches.score)} matches")
-    if value.ties is not None:
-        found.append(f"{len(value.ties.score)} ties")
-    if value.T_target_source is not None:
+    if value.ties is not None and value.ties is not before.ties:
+        found.append(f"{len(value.ties.score)} ties, {int(np.sum(value.ties.inlier))} agreeing")
+    if value.T_target_source is not None and value.T_target_source is not before.T_target_source:
         found.append("a transform")
-    if value.verdict is not None:
+    if value.verdict is not None and value.verdict is not before.verdict:
         found.append(f"verdict {value.verdict.name}")
-    if not found and value.target.bev is not None:
-        found.append("rasters")
-    return ", ".join(found) or "two clouds in their work frames"
+    return ", ".join(found) or "done"
 
 
 def _bounds(xyz: Floats) -> Floats:

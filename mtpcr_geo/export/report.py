@@ -30,7 +30,8 @@ h3{font-size:15px;margin:0 0 6px}
 .verdict b{font-size:21px;text-transform:capitalize}
 .accepted{border-color:#1a9850}.doubtful{border-color:#e6a117}.refused{border-color:#d73027}
 .none{border-color:#8a949e}
-.grid{display:grid;grid-template-columns:repeat(auto-fit,minmax(330px,1fr));gap:18px}
+.grid{display:grid;grid-template-columns:repeat(auto-fit,minmax(440px,1fr));gap:18px;align-items:start}
+.stack{display:grid;gap:18px;align-content:start}
 .wide{grid-column:1/-1}
 table{border-collapse:collapse;width:100%}
 td,th{text-align:left;vertical-align:top;padding:4px 10px 4px 0;border-bottom:1px solid var(--line)}
@@ -135,7 +136,8 @@ def _pictures(pair: Pair) -> str:
     if both and pair.T_target_source is not None:
         source, target = draw.common_rasters(pair)
         overlay = (
-            "Source laid over the target. Where it fits, the source's edges run along the target's. "
+            "The source laid over the target, where they overlap: if it fits, the source's edges run along "
+            "the target's. "
             + _key(draw.SOURCE_RGB, "source")
             + _key(draw.TARGET_RGB, "target")
         )
@@ -152,8 +154,9 @@ def _pictures(pair: Pair) -> str:
 
 def _checks(pair: Pair) -> str:
     parts = []
+    checks = ""
     if pair.verdict is not None and pair.verdict.metrics:
-        parts.append(f"<div><h3>Checks</h3>{_table(story.metric_rows(pair.verdict.metrics))}</div>")
+        checks = f"<div><h3>Checks</h3>{_table(story.metric_rows(pair.verdict.metrics))}</div>"
     if pair.matches is not None and pair.matches.hypotheses:
         best = pair.matches.hypotheses[:10]
         rows = story.hypothesis_rows(pair)[: len(best)]
@@ -169,7 +172,9 @@ def _checks(pair: Pair) -> str:
         )
     if pair.ties is not None and pair.T_target_source is not None and len(pair.ties.target):
         parts += _tie_charts(pair)
-    return f'<div class="grid">{"".join(parts)}</div>' if parts else "<p>Nothing to judge by was found.</p>"
+    if not parts and not checks:
+        return "<p>Nothing to judge by was found.</p>"
+    return f'<div class="grid">{checks}<div class="stack">{"".join(parts)}</div></div>'
 
 
 def _tie_charts(pair: Pair) -> list[str]:

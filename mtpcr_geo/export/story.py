@@ -76,11 +76,12 @@ def transform_rows(pair: Pair) -> list[Row]:
             shift = after - before
             rows.append(("the middle moves by", f"{_numbers(shift, 3, sign=True)} (x, y, z in file units)"))
     if pair.ties is not None and len(pair.ties.target):
-        residual = residuals(pair)
         inlier = np.asarray(pair.ties.inlier, bool)
-        rows.append(("ties", f"{len(residual)}, of which {int(inlier.sum())} agree with the transform"))
+        rows.append(("ties", f"{len(inlier)}, of which {int(inlier.sum())} agree with the transform"))
         if inlier.any():
-            rows.append(("misfit of agreeing ties", f"median {np.median(residual[inlier]):.3f} m"))
+            off = misfits(pair)[inlier]
+            plan, height = np.median(np.hypot(off[:, 0], off[:, 1])), np.median(np.abs(off[:, 2]))
+            rows.append(("misfit of those", f"median {plan:.2f} m in plan, {height:.2f} m in height"))
     return rows
 
 
@@ -97,12 +98,10 @@ def worked_example(pair: Pair) -> tuple[Floats, Floats] | None:
     return before, np.asarray(pair.target.link.to_file(work)[0])
 
 
-def residuals(pair: Pair) -> Floats:
-    """Give the misfit of each tie under the transform, (n,) metres; NaN where there is no transform."""
+def misfits(pair: Pair) -> Floats:
+    """Give registered source minus target of each tie, (n, 3) metres; NaN where there is no transform."""
     target, registered = tie_positions(pair)
-    if registered is None:
-        return np.full(len(target), np.nan)
-    return np.asarray(np.linalg.norm(registered - target, axis=1))
+    return np.full_like(target, np.nan) if registered is None else registered - target
 
 
 def hypothesis_rows(pair: Pair) -> list[tuple[str, ...]]:
@@ -113,7 +112,7 @@ def hypothesis_rows(pair: Pair) -> list[tuple[str, ...]]:
     return [
         (
             str(rank),
-            f"{math.degrees(one.yaw) % 360.0:.1f}°",
+            f"{_half_turn(math.degrees(one.yaw)):+.1f}°",
             f"{one.shift[0]:+.1f}, {one.shift[1]:+.1f} m",
             f"{one.score:.4g}",
             f"{one.overlap_cells * cell * cell:,.0f} m²" if one.overlap_cells else "",
@@ -124,7 +123,7 @@ def hypothesis_rows(pair: Pair) -> list[tuple[str, ...]]:
 
 def matrix_text(T: Floats) -> str:
     """Write a 4x4 with 17 significant digits, a row a line."""
-    return "\n".join("  ".join(f"{value: .17g}" for value in row) for row in T)
+    return "\n".join("  ".join(f"{value: .17g}".ljust(24) for value in row).rstrip() for row in T)
 
 
 def plain(value: Any) -> str:
@@ -155,10 +154,12 @@ def _metric_row(key: str, value: Any) -> Row:
         value = value.item()
     if isinstance(value, bool):
         return _words(key), "yes" if value else "no"
+    if isinstance(value, list | tuple | np.ndarray) and key.endswith("_m"):
+        return _words(key.removesuffix("_m")), f"{_numbers(np.asarray(value), 3)} m"
     if not isinstance(value, int | float):
         return _words(key), plain(value)
     if key.endswith(_SHARES):
-        return _words(key.removesuffix("_share")), f"{100 * float(value):.1f} %"
+        return _words(key), f"{100 * float(value):.1f} %"
     for suffix, unit in _UNITS:
         if key.endswith(suffix):
             gap = "" if unit == "°" else " "
@@ -169,7 +170,7 @@ def _metric_row(key: str, value: Any) -> Row:
 def _short(value: float) -> str:
     if float(value).is_integer() and abs(value) < 1e15:
         return f"{int(value):,}"
-    return f"{value:,.1f}" if abs(value) >= 1000 else f"{value:.4g}"
+    return f"{value:,.1f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def _words(key: str) -> str:
@@ -178,3 +179,8 @@ def _words(key: str) -> str:
 
 def _numbers(values: Floats, digits: int, sign: bool = False) -> str:
     return ", ".join(f"{value:{'+' if sign else ''}.{digits}f}" for value in values)
+
+
+def _half_turn(degrees: float) -> float:
+    """Wrap degrees to -180..180 as they will be shown, without a minus before zero."""
+    return round((degrees + 180.0) % 360.0 - 180.0, 1) + 0.0
