@@ -36,6 +36,7 @@ _BROKEN = (
     KeyError,
     AssertionError,
 )
+_CHUNK_MOST = 10_000_000  # points that a chunk may promise beyond those of the file
 _XYZ = Fields.XY_RETURNS_CHANNEL | Fields.Z
 _XYZ_AND_CLASS = _XYZ | Fields.CLASSIFICATION | Fields.FLAGS
 
@@ -219,7 +220,8 @@ def _check_chunk_table(stream: BinaryIO, header: laspy.LasHeader, records: list[
     entries = lazrs.read_chunk_table(stream, vlr)
     fits = sum(length for _, length in entries) <= table - start
     # with chunks of one size, the table promises full ones, the last one too
-    if not fits or sum(points for points, _ in entries) < header.point_count:
+    promised = [points for points, _ in entries]
+    if not fits or sum(promised) < header.point_count or max(promised) > max(header.point_count, _CHUNK_MOST):
         raise ValueError("the table of its compressed chunks does not fit its header")
 
 
