@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo import geometry
 from mtpcr_geo.errors import RegistrationError
 from mtpcr_geo.raster import Grid
 from mtpcr_geo.scene import Bev
@@ -148,10 +149,9 @@ def density(xyz: Floats, count: int) -> Density:
         count: number of points in the whole cloud.
 
     """
-    keys = np.floor(xyz[:, :2] / OCCUPANCY_CELL_M).astype(np.int64)
-    keys -= keys.min(axis=0)
-    occupied = len(np.unique(keys[:, 0] * (keys[:, 1].max() + 1) + keys[:, 1]))
-    area = occupied * OCCUPANCY_CELL_M**2
+    low, high = geometry.bounds(xyz[:, :2])
+    grid = grid_around(low, high, OCCUPANCY_CELL_M)
+    area = int((rasterise([xyz], grid).count > 0).sum()) * OCCUPANCY_CELL_M**2
     return Density(area, count / area)
 
 

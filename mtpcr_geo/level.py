@@ -84,8 +84,9 @@ def thin(xyz: Floats, edge: float, rng: np.random.Generator, most: int) -> Float
     """Keep one point a cube of ``edge`` metres, and a random ``most`` of those."""
     if len(xyz) > 1_500_000:
         xyz = xyz[rng.choice(len(xyz), 1_500_000, replace=False)]
-    cube = np.floor((xyz - xyz.min(axis=0)) / edge).astype(np.int64)
-    span = cube.max(axis=0) + 1
+    low, high = geometry.bounds(xyz)
+    cube = np.floor((xyz - low) / edge).astype(np.int64)
+    span = np.floor((high - low) / edge).astype(np.int64) + 1
     _, first = np.unique((cube[:, 0] * span[1] + cube[:, 1]) * span[2] + cube[:, 2], return_index=True)
     if len(first) > most:
         first = rng.choice(first, most, replace=False)

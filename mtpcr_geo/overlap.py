@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo import geometry
 from mtpcr_geo.bev import grid_around, rasterise
 from mtpcr_geo.raster import Grid
 from mtpcr_geo.scene import Bev
@@ -72,8 +73,8 @@ class Overlap:
 
 def overlap_of(source: Floats, target: Floats, cell: float = OVERLAP_CELL_M, reach: int = 1) -> Overlap:
     """Lay both clouds, (n, 3) and (m, 3) metres in one frame, on one grid over the part they may share."""
-    low = np.maximum(source.min(axis=0), target.min(axis=0)) - 2 * cell
-    high = np.minimum(source.max(axis=0), target.max(axis=0)) + 2 * cell
+    (low_s, high_s), (low_t, high_t) = geometry.bounds(source), geometry.bounds(target)
+    low, high = np.maximum(low_s, low_t) - 2 * cell, np.minimum(high_s, high_t) + 2 * cell
     grid = grid_around(low, np.maximum(high, low + cell), cell)
     s, t = rasterise([source], grid), rasterise([target], grid)
     window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)

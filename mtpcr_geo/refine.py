@@ -134,12 +134,13 @@ def _near(points: Floats, others: Floats, reach: float) -> NDArray[np.bool_]:
     """Tell which points may have one of the others within reach, by cubes of that edge."""
     from scipy.ndimage import binary_dilation
 
-    low = np.minimum(points.min(axis=0), others.min(axis=0)) - 2 * reach
-    cube = np.floor((points - low) / reach).astype(np.int64)
-    other = np.floor((others - low) / reach).astype(np.int64)
-    filled = np.zeros(np.maximum(cube.max(axis=0), other.max(axis=0)) + 2, bool)
-    filled[tuple(other.T)] = True
-    return np.asarray(binary_dilation(filled, np.ones((3, 3, 3), bool))[tuple(cube.T)])
+    (low_p, high_p), (low_o, high_o) = geometry.bounds(points), geometry.bounds(others)
+    low = np.minimum(low_p, low_o) - 2 * reach
+    shape = np.floor((np.maximum(high_p, high_o) - low) / reach).astype(int) + 2
+    filled = np.zeros(tuple(shape.tolist()), dtype=np.bool_)
+    filled[tuple(np.floor((others - low) / reach).astype(np.int64).T)] = True
+    near = binary_dilation(filled, np.ones((3, 3, 3), np.bool_))
+    return np.asarray(near[tuple(np.floor((points - low) / reach).astype(np.int64).T)])
 
 
 def _at_most(cloud: Any, most: int) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -129,7 +130,9 @@ def match_patches(
 def _patch_sums(image: Image, stride: int) -> Image:
     """Sum over patches of 2 x stride cells, one every stride cells."""
     height, width = image.shape
-    blocks = image.reshape(height // stride, stride, width // stride, stride).sum(axis=(1, 3))
+    size = (width // stride, height // stride)
+    # shrinking by a whole factor is the mean over blocks, and much faster than summing over axes
+    blocks = cv2.resize(image, size, interpolation=cv2.INTER_AREA) * np.float32(stride**2)
     return np.asarray(blocks[:-1, :-1] + blocks[1:, :-1] + blocks[:-1, 1:] + blocks[1:, 1:])
 
 

@@ -142,7 +142,7 @@ class MakeBev(Stage):
         made = []
         for side, dense in zip(sides, densities, strict=True):
             levelled = side.levelled_sample
-            low, high = levelled.min(axis=0), levelled.max(axis=0)
+            low, high = geometry.bounds(levelled)
             whole = bool(side.level_report.get("complete", True))
             if not whole:
                 # the sample may miss the outermost points
