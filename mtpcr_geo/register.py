@@ -95,19 +95,22 @@ def build_pipeline(
         {"type": "mtpcr.solve", "tag": "solve", **seed},
         {"type": "mtpcr.refine", "tag": "refine"},
         {"type": "mtpcr.assess", "tag": "assess"},
-        {"type": "mtpcr.write_bev", "filename": where["bev"]},
-        {"type": "mtpcr.write_ties", "filename": where["ties"]},
-        {"type": "mtpcr.write_transform", "filename": where["transform"], "force": options.force},
-        {"type": "mtpcr.write_transform", "filename": where["matrix"], "force": options.force},
-        {"type": "mtpcr.write_transform", "filename": where["pdal"], "force": options.force},
-        {"type": "mtpcr.write_report", "filename": where["report"]},
-        {"type": "mtpcr.write_run", "filename": where["run"]},
-        {"type": "mtpcr.apply", "force": options.force},
+        {"type": "mtpcr.write_bev", "tag": "rasters", "filename": where["bev"]},
+        {"type": "mtpcr.write_ties", "tag": "ties", "filename": where["ties"]},
+        *(
+            {"type": "mtpcr.write_transform", "tag": tag, "filename": where[tag], "force": options.force}
+            for tag in ("transform", "matrix", "pdal")
+        ),
+        {"type": "mtpcr.write_report", "tag": "report", "filename": where["report"]},
+        {"type": "mtpcr.write_run", "tag": "run", "filename": where["run"]},
+        {"type": "mtpcr.apply", "tag": "moved", "force": options.force},
         {"type": "writers.las", "tag": "registered", "filename": where["registered"]},
     ]
     if options.recording:
         before = next(i for i, stage in enumerate(stages) if stage["type"] == "mtpcr.write_report")
-        stages.insert(before, {"type": "mtpcr.write_recording", "filename": where["recording"]})
+        stages.insert(
+            before, {"type": "mtpcr.write_recording", "tag": "recording", "filename": where["recording"]}
+        )
     return [_without_defaults(stage) for stage in stages]
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -49,10 +50,11 @@ def test_run_json_tells_the_whole_run(registered, town_files):
     run = json.loads((out / "run.json").read_text(encoding="utf-8"))
     assert run["verdict"] == result.verdict.name
     assert run["reasons"] == list(result.verdict.reasons)
-    assert {"verdict", "reasons", "time_s", "peak_memory_mb", "versions"} <= set(run)
+    assert {"verdict", "reasons", "time_s", "peak_memory_mb", "versions", "options"} <= set(run)
+    assert {"level", "bev", "match", "solve", "refine", "registered", "total"} <= set(run["time_s"])
+    assert run["time_s"]["total"] >= max(run["time_s"][tag] for tag in ("match", "refine"))
+    np.testing.assert_array_equal(run["T_target_source"], result.T_target_source)
     text = json.dumps(run)
-    import hashlib
-
     for file in town_files:
         assert hashlib.sha256(file.read_bytes()).hexdigest() in text
 

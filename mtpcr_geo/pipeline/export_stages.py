@@ -257,8 +257,11 @@ def run_facts(pair: Pair | None, context: RunContext) -> dict[str, Any]:
         "verdict": verdict.name if verdict else None,
         "reasons": list(verdict.reasons) if verdict else [],
         "metrics": verdict.metrics if verdict else {},
+        # found, which says nothing of whether to use it: that is the verdict
+        "T_target_source": pair.T_file if pair is not None and pair.T_target_source is not None else None,
         "time_s": {**seconds, "total": round(time.perf_counter() - context.facts["started"], 4)},
         "peak_memory_mb": peak_memory_mb(),
+        "options": {entry["tag"]: entry["options"] for entry in context.done},
         "stages": context.done,
         "pipeline": context.facts["pipeline"],
         "versions": context.facts.get("versions", {}),
