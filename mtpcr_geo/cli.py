@@ -34,7 +34,7 @@ class _Group(TyperGroup):
             typer.echo(f"mtpcr-geo: error: {' '.join(str(error).split())}", err=True)
             raise typer.Exit(error.exit_code) from None
         except KeyboardInterrupt:
-            typer.echo("mtpcr-geo: interrupted; nothing was written", err=True)
+            typer.echo("mtpcr-geo: interrupted; no half-written file is left", err=True)
             raise typer.Exit(EXIT_INTERRUPTED) from None
 
 

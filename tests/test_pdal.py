@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -228,3 +230,22 @@ def test_paths_with_spaces(pdal, town_files, tmp_path: Path):
     (place / "in put.laz").write_bytes(town_files[1].read_bytes())
     ours = run_ours([str(place / "in put.laz"), *CLEAN_UPS["streamed"], str(place / "out put.laz")])
     assert [path.name for path in ours.outputs] == ["out put.laz"]
+
+
+def test_benchmark_of_rasters_runs(pdal, town_files):
+    done = subprocess.run(
+        [
+            sys.executable,
+            REPOSITORY / "examples" / "benchmark_bev.py",
+            town_files[1],
+            "--runs",
+            "1",
+            "--json",
+        ],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    table = json.loads(done.stdout)
+    assert set(table) == {"mtpcr-geo", "PDAL"}
+    assert all(row["best_s"] > 0 for row in table.values())

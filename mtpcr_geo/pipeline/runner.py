@@ -103,7 +103,8 @@ def execute(
         context = _context(specs, outputs, progress or NoProgress(), settings)
         with closing(context):
             _check(stages, context)
-            context.facts |= {"versions": versions(), "inputs": _input_facts(stages)}
+            if any(stage.evidence for stage in stages.values()):
+                context.facts |= {"versions": versions(), "inputs": _input_facts(stages)}
             for stage in stages.values():
                 stage.open(context)
             context.recorder.begin(context.facts)
