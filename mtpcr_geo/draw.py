@@ -61,8 +61,8 @@ def hillshade(top: NDArray[np.float32], cell: float) -> Picture:
     if not filled.any():
         return np.zeros(top.shape, np.uint8)
     z = _masked_blur(top, filled, 1.0, fill=True)
-    dy, dx = np.gradient(z, cell)
-    dy = -dy  # rows run south
+    dx = np.gradient(z, cell, axis=1) if z.shape[1] > 1 else np.zeros_like(z)
+    dy = -np.gradient(z, cell, axis=0) if z.shape[0] > 1 else np.zeros_like(z)  # rows run south
     light = np.zeros(top.shape, np.float32)
     for azimuth, weight in ((315.0, 0.6), (270.0, 0.2), (0.0, 0.2)):
         a, h = np.deg2rad(azimuth), np.deg2rad(45.0)
@@ -79,6 +79,12 @@ def shaded_relief(top: NDArray[np.float32], cell: float) -> Picture:
     shade = hillshade(top, cell).astype(np.float32)[..., None] / 255.0
     lit = colour.astype(np.float32) * (0.35 + 0.85 * shade)
     return np.where(filled[..., None], np.clip(lit, 0, 255), np.array(EMPTY_RGB)).astype(np.uint8)
+
+
+def relief_of(bev: Bev, max_side: int) -> Picture:
+    """Show a BEV as shaded relief, from every n-th cell only where it has more than `max_side` a side."""
+    step = max(1, int(np.ceil(max(bev.grid.shape) / max_side)))
+    return shaded_relief(bev.top[::step, ::step], bev.grid.cell * step)
 
 
 def height_range(z: NDArray[np.floating]) -> tuple[float, float]:
@@ -103,7 +109,8 @@ def residual_colours(residual_m: Floats, good_m: float, bad_m: float) -> Picture
     """Colour residuals: green up to `good_m`, over yellow, to red from `bad_m`. (n,) in, (n, 3) out."""
     stops = np.array([GOOD_RGB, FAIR_RGB, BAD_RGB], np.float64)
     place = np.clip((residual_m - good_m) / max(bad_m - good_m, 1e-9), 0.0, 1.0) * 2.0
-    return np.stack([np.interp(place, [0, 1, 2], stops[:, k]) for k in range(3)], axis=-1).astype(np.uint8)
+    mixed = [np.interp(place, [0, 1, 2], stops[:, k]) for k in range(3)]
+    return np.asarray(np.rint(np.stack(mixed, axis=-1)), np.uint8)
 
 
 def residual_limits(residual_m: Floats, inlier: NDArray[np.bool_]) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ BANDS = (
 )
 _TILE = 256
 _SMALLEST_OVERVIEW = 128
+_WARP_CELLS = 500_000
 
 
 def write_bev(
@@ -55,7 +57,7 @@ def write_bev(
     """
     import rasterio
     from rasterio.enums import Resampling
-    from rasterio.errors import RasterioError
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
     level = np.eye(4) if T_level_work is None else np.asarray(T_level_work, np.float64)
     upright = bool(np.array_equal(level, np.eye(4)))
@@ -87,7 +89,9 @@ def write_bev(
         **(tags or {}),
     }
     try:
-        with rasterio.Env(GDAL_PAM_ENABLED="NO"):
+        with rasterio.Env(GDAL_PAM_ENABLED="NO"), warnings.catch_warnings():
+            # a local raster with its corner at zero is georeferenced all the same
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
             with rasterio.open(path, "w", **profile) as out:
                 out.update_tags(**every_tag)
                 for index, (text, unit) in enumerate(BANDS, start=1):
@@ -104,8 +108,14 @@ def write_bev(
         raise OutputError(f"cannot write the raster {Path(path)}: {error}") from error
 
 
-def write_side_bev(path: str | os.PathLike[str], side: Side) -> None:
+def write_side_bev(path: str | os.PathLike[str], side: Side, frame: WorkFrame | None = None) -> None:
     """Write a side's BEV in that side's own frame.
+
+    Args:
+        path: where to write.
+        side: a side with a BEV.
+        frame: the pair's work frame, whose CRS the side's work coordinates have where its link
+            converts units or CRS; without it such a raster gets no CRS.
 
     Raises:
         ValueError: if the side has no BEV yet.
@@ -114,9 +124,11 @@ def write_side_bev(path: str | os.PathLike[str], side: Side) -> None:
     """
     if side.bev is None:
         raise ValueError(f"the {side.role} has no BEV yet")
-    frame = WorkFrame(side.link.file_crs, side.link.origin)
+    link = side.link
+    converted = link.pipeline is not None or bool(np.any(link.factor != 1.0))
+    crs = link.file_crs if not converted else frame.crs if frame is not None else None
     tags = {"ROLE": side.role, "CLOUD": Path(side.cloud.name).name}
-    write_bev(path, side.bev, frame, T_level_work=side.T_level_work, tags=tags)
+    write_bev(path, side.bev, WorkFrame(crs, link.origin), T_level_work=side.T_level_work, tags=tags)
 
 
 def write_registered_bev(path: str | os.PathLike[str], pair: Pair) -> None:
@@ -157,14 +169,20 @@ def registered_bev(pair: Pair) -> Bev:
 def grid_around(bev: Bev, T_to_bev: Floats) -> Grid:
     """Give the grid, aligned to whole cells, that holds a BEV's filled cells moved by a 4x4 transform."""
     cell = bev.grid.cell
-    rows, columns = np.nonzero(np.isfinite(bev.top))
+    filled = np.isfinite(bev.top)
+    rows = np.flatnonzero(filled.any(axis=1))
     if len(rows) == 0:
         return Grid(0.0, cell, cell, 1, 1)
-    plan = bev.grid.to_metres(np.column_stack([columns, rows]).astype(np.float64))
-    moved = geometry.apply(T_to_bev, np.column_stack([plan, bev.top[rows, columns]]))[:, :2]
+    # the ends of the rows bound all cells between them
+    first = filled[rows].argmax(axis=1)
+    last = bev.grid.width - 1 - filled[rows, ::-1].argmax(axis=1)
+    ends = np.column_stack([np.concatenate([first, last]), np.concatenate([rows, rows])])
+    xyz = np.column_stack([bev.grid.to_metres(ends.astype(np.float64)), bev.top[ends[:, 1], ends[:, 0]]])
+    moved = geometry.apply(T_to_bev, xyz)[:, :2]
     low = np.floor(moved.min(axis=0) / cell - 0.5)
     high = np.ceil(moved.max(axis=0) / cell + 0.5)
-    return Grid(low[0] * cell, high[1] * cell, cell, int(high[0] - low[0]), int(high[1] - low[1]))
+    width, height = (int(size) for size in high - low)
+    return Grid(float(low[0]) * cell, float(high[1]) * cell, cell, width, height)
 
 
 def warp_bev(bev: Bev, T_to_bev: Floats, grid: Grid) -> Bev:
@@ -179,34 +197,41 @@ def warp_bev(bev: Bev, T_to_bev: Floats, grid: Grid) -> Bev:
         grid: where to resample to.
 
     """
-    T_bev_to = geometry.inverse(T_to_bev)
-    columns, rows = np.meshgrid(np.arange(grid.width), np.arange(grid.height))
-    plan = grid.to_metres(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
     filled = np.isfinite(bev.top)
-    z_guess = float(np.median(bev.top[filled])) if filled.any() else 0.0
-    ground = (T_to_bev @ np.array([0.0, 0.0, z_guess, 1.0]))[2]
-    z_to = np.full(len(plan), ground)
+    height = float(np.median(bev.top[filled])) if filled.any() else 0.0
+    top = np.full(grid.shape, np.nan, np.float32)
+    low = np.full(grid.shape, np.nan, np.float32)
+    count = np.zeros(grid.shape, np.uint32)
+    rows_at_once = max(1, _WARP_CELLS // grid.width)
+    for start in range(0, grid.height, rows_at_once):
+        rows = np.arange(start, min(start + rows_at_once, grid.height))
+        row = np.repeat(rows, grid.width)
+        column = np.tile(np.arange(grid.width), len(rows))
+        plan = grid.to_metres(np.column_stack([column, row]).astype(np.float64))
+        found, xyz_bev, index = _look_back(bev, filled, T_to_bev, plan, height)
+        row, column, xyz_bev, index = row[found], column[found], xyz_bev[found], index[found]
+        top[row, column] = _move_z(T_to_bev, xyz_bev, bev.top.ravel()[index])
+        low[row, column] = _move_z(T_to_bev, xyz_bev, bev.low.ravel()[index])
+        count[row, column] = bev.count.ravel()[index]
+    return Bev(grid, top, low, count)
+
+
+def _look_back(
+    bev: Bev, filled: NDArray[np.bool_], T_to_bev: Floats, plan: Floats, height: float
+) -> tuple[NDArray[np.bool_], Floats, NDArray[np.int64]]:
+    """Find the BEV's cell for each of (n, 2) places: found or not, (n, 3) place in the BEV, flat index."""
+    T_bev_to = geometry.inverse(T_to_bev)
+    z_to = np.full(len(plan), (T_to_bev @ np.array([0.0, 0.0, height, 1.0]))[2])
     tilted = abs(T_to_bev[2, 2]) < 1.0 - 1e-7
-    found = np.zeros(len(plan), bool)
-    index = np.zeros(len(plan), np.int64)
-    xyz_bev = np.zeros((len(plan), 3))
-    for step in range(3 if tilted else 1):
-        if step:
-            z_to = np.where(found, _move_z(T_to_bev, xyz_bev, bev.top.ravel()[index]), z_to)
+    for last in (False, False, True) if tilted else (True,):
         xyz_bev = geometry.apply(T_bev_to, np.column_stack([plan, z_to]))
         pixel = np.rint(bev.grid.to_pixel(xyz_bev[:, :2])).astype(np.int64)
         inside = ((pixel >= 0) & (pixel < [bev.grid.width, bev.grid.height])).all(axis=1)
         index = np.where(inside, pixel[:, 1] * bev.grid.width + pixel[:, 0], 0)
         found = inside & filled.ravel()[index]
-    top = np.where(found, _move_z(T_to_bev, xyz_bev, bev.top.ravel()[index]), np.nan)
-    low = np.where(found, _move_z(T_to_bev, xyz_bev, bev.low.ravel()[index]), np.nan)
-    count = np.where(found, bev.count.ravel()[index], 0)
-    return Bev(
-        grid,
-        top.reshape(grid.shape).astype(np.float32),
-        low.reshape(grid.shape).astype(np.float32),
-        count.reshape(grid.shape).astype(np.uint32),
-    )
+        if not last:
+            z_to = np.where(found, _move_z(T_to_bev, xyz_bev, bev.top.ravel()[index]), z_to)
+    return found, xyz_bev, index
 
 
 def geotransform(grid: Grid, origin: Floats) -> Any:

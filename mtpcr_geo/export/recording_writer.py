@@ -149,7 +149,7 @@ class RecordingWriter:
         bev = side.bev
         assert bev is not None
         path = f"bev/{side.role}"
-        self._log_image(f"{path}/relief", draw.shaded_relief(bev.top, bev.grid.cell))
+        self._log_image(f"{path}/relief", draw.relief_of(bev, _IMAGE_SIDE))
         self._log_image(f"{path}/bandpass", draw.band_grey(bev.top, bev.grid.cell))
         step = int(np.ceil(max(bev.grid.shape) / _IMAGE_SIDE))
         top = np.ascontiguousarray(bev.top[::step, ::step])
@@ -173,7 +173,8 @@ class RecordingWriter:
             return
         picture, ends, colours, kind = draw.match_lines(pair)
         scale = min(1.0, _IMAGE_SIDE / max(picture.shape[:2]))
-        self._log_image("matches/image", picture)
+        if self._new("matches picture", (pair.source.bev, pair.target.bev)):
+            self._log_image("matches/image", picture)
         self._recorded.images["matches"] = self._recorded.images["matches/image"]
         ends = (ends + 0.5) * scale  # rerun's pixels have their centres at halves
         for number, name in enumerate(_KINDS):

@@ -116,7 +116,7 @@ def _pictures(pair: Pair) -> str:
     sides = [pair.target] if pair.source is pair.target else [pair.source, pair.target]
     for side in sides:
         if side.bev is not None:
-            picture = draw.shaded_relief(side.bev.top, side.bev.grid.cell)
+            picture = draw.relief_of(side.bev, _PICTURE_SIDE)
             caption = (
                 f"{side.role.capitalize()} seen from above: highest point per {side.bev.grid.cell:g} m cell, "
                 "dark blue low to yellow high, lit from north-west; cells without points are dark."
@@ -137,9 +137,7 @@ def _pictures(pair: Pair) -> str:
         source, target = draw.common_rasters(pair)
         overlay = (
             "The source laid over the target, where they overlap: if it fits, the source's edges run along "
-            "the target's. "
-            + _key(draw.SOURCE_RGB, "source")
-            + _key(draw.TARGET_RGB, "target")
+            "the target's. " + _key(draw.SOURCE_RGB, "source") + _key(draw.TARGET_RGB, "target")
         )
         figures.append(_figure(draw.edge_overlay(source, target), overlay))
         board = (
