@@ -81,10 +81,10 @@ def shaded_relief(top: NDArray[np.float32], cell: float) -> Picture:
     return np.where(filled[..., None], np.clip(lit, 0, 255), np.array(EMPTY_RGB)).astype(np.uint8)
 
 
-def relief_of(bev: Bev, max_side: int) -> Picture:
-    """Show a BEV as shaded relief, from every n-th cell only where it has more than `max_side` a side."""
-    step = max(1, int(np.ceil(max(bev.grid.shape) / max_side)))
-    return shaded_relief(bev.top[::step, ::step], bev.grid.cell * step)
+def thinned(bev: Bev, max_side: int) -> tuple[NDArray[np.float32], float, int]:
+    """Give a BEV's heights with at most `max_side` cells a side: every n-th cell, the cell's edge, and n."""
+    step = max(1, -(-max(bev.grid.shape) // max_side))
+    return bev.top[::step, ::step], bev.grid.cell * step, step
 
 
 def height_range(z: NDArray[np.floating]) -> tuple[float, float]:
@@ -138,10 +138,13 @@ def side_by_side(left: Picture, right: Picture, gap: int = 12) -> tuple[Picture,
     return out, (float(column), float(row_right))
 
 
-def match_lines(pair: Pair, gap: int = 12) -> tuple[Picture, Floats, NDArray[np.uint8], NDArray[np.int8]]:
+def match_lines(
+    pair: Pair, gap: int = 12, max_side: int = 2048
+) -> tuple[Picture, Floats, NDArray[np.uint8], NDArray[np.int8]]:
     """Lay out both BEVs side by side (source left) with the lines that link them.
 
-    Ties are drawn once there are any (they know inliers), else the matches themselves.
+    Ties are drawn once there are any (they know inliers), else the matches themselves. Of a BEV with more
+    than `max_side` cells a side only every n-th is drawn.
 
     Returns:
         the picture; (n, 2, 2) line ends in its pixels (column, row; pixel centres at integers);
@@ -154,8 +157,9 @@ def match_lines(pair: Pair, gap: int = 12) -> tuple[Picture, Floats, NDArray[np.
     source, target = pair.source.bev, pair.target.bev
     if source is None or target is None or pair.matches is None:
         raise ValueError("matches are drawn once both BEVs and the matches are there")
-    left = band_grey(source.top, source.grid.cell)
-    right = band_grey(target.top, target.grid.cell)
+    source_top, source_cell, source_step = thinned(source, max_side)
+    target_top, target_cell, target_step = thinned(target, max_side)
+    left, right = band_grey(source_top, source_cell), band_grey(target_top, target_cell)
     picture, (column, row) = side_by_side(left, right, gap)
     if pair.ties is None:
         source_px, target_px = pair.matches.source_px, pair.matches.target_px
@@ -168,7 +172,8 @@ def match_lines(pair: Pair, gap: int = 12) -> tuple[Picture, Floats, NDArray[np.
         if pair.T_target_source is None:
             kind[:] = 3
     offset_left = np.array([0.0, (picture.shape[0] - left.shape[0]) // 2])
-    ends = np.stack([source_px + offset_left, target_px + np.array([column, row])], axis=1)
+    offset_right = np.array([column, row])
+    ends = np.stack([source_px / source_step + offset_left, target_px / target_step + offset_right], axis=1)
     colours = np.array([BAD_RGB, GOOD_RGB, WITHHELD_RGB, UNJUDGED_RGB], np.uint8)[kind]
     return picture, ends, colours, kind
 
@@ -182,7 +187,7 @@ def matches_picture(pair: Pair, max_side: int = 1400, most: int = 150) -> Pictur
     """
     import cv2
 
-    picture, ends, colours, kind = match_lines(pair)
+    picture, ends, colours, kind = match_lines(pair, max_side=max_side)
     scale = max_side / max(picture.shape[:2])
     if scale >= 2.0:
         scale = float(int(scale))

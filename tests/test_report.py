@@ -180,7 +180,16 @@ def test_empty_rasters_can_be_drawn():
     assert draw.shaded_relief(empty, 1.0).shape == (4, 5, 3)
     assert draw.fit(np.zeros((10, 40, 3), np.uint8), 20).shape == (5, 20, 3)
     bev = rasterise(np.array([[0.2, 0.2, 1.0]]))
-    assert draw.relief_of(bev, 100).shape[2] == 3
+    assert draw.shaded_relief(bev.top, 1.0).shape == (1, 1, 3)
+
+
+def test_thinned_lines_still_end_at_what_they_mean():
+    pair = make_pair(2000, state="matched")
+    picture, ends, _, _ = draw.match_lines(pair, gap=0, max_side=50)
+    assert max(draw.thinned(pair.source.bev, 50)[0].shape) <= 50
+    step = draw.thinned(pair.target.bev, 50)[2]
+    left = picture.shape[1] - -(-pair.target.bev.grid.width // step)
+    assert np.allclose((ends[:, 1, 0] - left) * step, pair.matches.target_px[:, 0])
 
 
 def test_residual_colours_run_from_green_to_red():

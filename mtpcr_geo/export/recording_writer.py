@@ -149,10 +149,10 @@ class RecordingWriter:
         bev = side.bev
         assert bev is not None
         path = f"bev/{side.role}"
-        self._log_image(f"{path}/relief", draw.relief_of(bev, _IMAGE_SIDE))
-        self._log_image(f"{path}/bandpass", draw.band_grey(bev.top, bev.grid.cell))
-        step = int(np.ceil(max(bev.grid.shape) / _IMAGE_SIDE))
-        top = np.ascontiguousarray(bev.top[::step, ::step])
+        top, cell, _ = draw.thinned(bev, _IMAGE_SIDE)
+        self._log_image(f"{path}/relief", draw.shaded_relief(top, cell))
+        self._log_image(f"{path}/bandpass", draw.band_grey(top, cell))
+        top = np.ascontiguousarray(top)
         low, high = draw.height_range(top[np.isfinite(top)])
         image = rr.DepthImage(top, meter=1.0, colormap="viridis", depth_range=(low, high))
         self._log(f"{path}/height", image)

@@ -116,7 +116,8 @@ def _pictures(pair: Pair) -> str:
     sides = [pair.target] if pair.source is pair.target else [pair.source, pair.target]
     for side in sides:
         if side.bev is not None:
-            picture = draw.relief_of(side.bev, _PICTURE_SIDE)
+            top, cell, _ = draw.thinned(side.bev, _PICTURE_SIDE)
+            picture = draw.shaded_relief(top, cell)
             caption = (
                 f"{side.role.capitalize()} seen from above: highest point per {side.bev.grid.cell:g} m cell, "
                 "dark blue low to yellow high, lit from north-west; cells without points are dark."
