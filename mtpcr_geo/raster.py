@@ -43,6 +43,6 @@ class Grid:
     def to_metres(self, pixel: NDArray[np.float64]) -> NDArray[np.float64]:
         """Take (n, 2) pixel coordinates (column, row) to (n, 2) metres: Eq. 5 with pixel centres."""
         pixel = np.asarray(pixel, np.float64)
-        return np.stack(
-            [self.west + (pixel[:, 0] + 0.5) * self.cell, self.north - (pixel[:, 1] + 0.5) * self.cell], axis=1
-        )
+        x = self.west + (pixel[:, 0] + 0.5) * self.cell
+        y = self.north - (pixel[:, 1] + 0.5) * self.cell
+        return np.stack([x, y], axis=1)

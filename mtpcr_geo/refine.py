@@ -77,7 +77,8 @@ def icp(
     moved = geometry.apply(T_start, source)
     overlap = overlap_of(moved, target)
     s, t = moved[overlap.select(moved)], target[overlap.select(target)]
-    s, t = s[_near(s, t, reach_m[0])], t[_near(t, s, reach_m[0])]
+    if min(len(s), len(t)) >= FEWEST_POINTS:
+        s, t = s[_near(s, t, reach_m[0])], t[_near(t, s, reach_m[0])]
     if min(len(s), len(t)) < FEWEST_POINTS:
         raise RegistrationError(
             f"only {min(len(s), len(t))} points of one cloud lie in the overlap, too few to refine"

@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers_scene import town
+
+from mtpcr_geo import geometry
+from mtpcr_geo.errors import RegistrationError
+from mtpcr_geo.overlap import overlap_of
+from mtpcr_geo.refine import icp, reaches_for, settle_on_ground
+
+
+@pytest.fixture(scope="module")
+def clouds() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(11)
+    return town(rng, 60_000), town(rng, 60_000)
+
+
+def off_by(yaw_deg: float, shift: tuple[float, float, float]) -> np.ndarray:
+    return geometry.compose(geometry.yaw_matrix(np.radians(yaw_deg)), np.array(shift))
+
+
+@pytest.mark.parametrize(
+    ("method", "within"), [("gicp", 0.1), ("point_to_plane", 0.45), ("point_to_point", 0.45)]
+)
+def test_icp_comes_back_from_a_rough_start(clouds, method: str, within: float) -> None:
+    source, target = clouds
+    found = icp(source, target, off_by(0.7, (0.8, -0.6, 0.4)), method=method)  # type: ignore[arg-type]
+    corners = np.array([[50.0, 50, 0], [-50, 50, 0], [-50, -50, 0], [50, -50, 5]])
+    assert np.linalg.norm(geometry.apply(found.T, corners) - corners, axis=1).max() < within
+
+
+def test_icp_is_the_same_at_each_run(clouds) -> None:
+    source, target = clouds
+    start = off_by(0.4, (0.5, 0.2, -0.3))
+    assert np.array_equal(icp(source, target, start).T, icp(source, target, start).T)
+
+
+def test_without_overlap_refinement_is_refused(clouds) -> None:
+    source, target = clouds
+    with pytest.raises(RegistrationError, match="overlap"):
+        icp(source, target, off_by(0.0, (300.0, 0.0, 0.0)))
+
+
+def test_ground_settles_height_and_tilt_though_roofs_differ(clouds) -> None:
+    source, target = clouds
+    raised = target.copy()
+    roofs = raised[:, 2] > 6.0
+    raised[roofs, 2] += 3.0
+    T = geometry.about(np.zeros(3), geometry.tilt_matrix(0.4, np.radians(0.5))) @ geometry.translation(
+        (0, 0, 0.8)
+    )
+    found = settle_on_ground(source, raised, T, tilt=True)
+    plain = np.array([[40.0, 40, 0], [-40, 40, 0], [-40, -40, 0], [40, -40, 0]])
+    assert np.abs((geometry.apply(found.T, plain) - plain)[:, 2]).max() < 0.12
+
+
+def test_overlap_is_what_both_fill() -> None:
+    rng = np.random.default_rng(12)
+    a = rng.uniform(0, 100, (60_000, 3)) * [1, 1, 0.01]
+    b = a + [60.0, 0.0, 0.0]
+    overlap = overlap_of(a, b)
+    assert overlap.area_m2 == pytest.approx(4000.0, rel=0.1)
+    assert overlap.select(a).mean() == pytest.approx(0.4, abs=0.05)
+
+
+def test_reaches_stop_at_the_spacing() -> None:
+    assert reaches_for(1.0) == (3.0, 1.5, 0.75)
+    assert reaches_for(2.0) == (3.0, 1.5)
+    assert reaches_for(4.0) == (3.0, 1.5)
