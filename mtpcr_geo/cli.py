@@ -202,11 +202,17 @@ def apply(
     out: Annotated[Path, typer.Argument(help="File to write: .las or .laz.", show_default=False)],
     inverse: Annotated[bool, typer.Option("--inverse", help="From target to source instead.")] = False,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
 ) -> None:
     """Stream any cloud through the transform of a run."""
     from mtpcr_geo.cloud.apply import apply_transform
 
-    apply_transform(transform, cloud, out, inverse=inverse, overwrite=overwrite)
+    with _progress(quiet) as progress:
+        written = apply_transform(
+            transform, cloud, out, inverse=inverse, overwrite=overwrite, progress=progress
+        )
+    if not quiet:
+        typer.echo(f"wrote {written}")
 
 
 @app.command()

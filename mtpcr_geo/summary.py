@@ -77,12 +77,11 @@ def _transform_rows(result: Registration) -> list[tuple[str, str]]:
     pair = result.pair
     if pair is None or pair.T_target_source is None or result.T_target_source is None:
         return []
+    from mtpcr_geo.crs import TransformChain
+
     T = result.T_target_source
     middle = (pair.source.cloud.minimum + pair.source.cloud.maximum) / 2
-    moved = pair.target.link.to_file(
-        geometry.apply(pair.T_target_source, pair.source.link.to_work(middle[np.newaxis]))
-    )[0]
-    shift = moved - middle
+    shift = TransformChain.of(pair).forward(middle[np.newaxis])[0] - middle
     yaw = math.degrees(geometry.yaw_of(T[:3, :3]))
     upright = geometry.yaw_matrix(geometry.yaw_of(T[:3, :3]))
     tilt = math.degrees(geometry.rotation_angle(upright.T @ T[:3, :3]))

@@ -121,7 +121,7 @@ BROKEN: dict[str, tuple[str | bytes, str, int]] = {
         "'EPSG:0' is not a coordinate",
         6,
     ),
-    "different CRSs": (chain({**LEVEL, "target_crs": "EPSG:2193"}), "reproject one of them", 6),
+    "different CRSs": (chain({**LEVEL, "target_crs": "EPSG:2193"}), "reproject one of", 6),
     # files
     "missing file": (
         json.dumps([{**TARGET, "filename": "tarjet.laz"}, OUT]),

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo import geometry
 from mtpcr_geo.cloud.base import CHUNK_POINTS, Cloud, PointTable
+from mtpcr_geo.crs import TransformChain
 from mtpcr_geo.scene import Pair
 
 Floats = NDArray[np.float64]
@@ -129,30 +129,22 @@ class Moved(Cloud):
 
     Attributes:
         base: the source cloud.
-        pair: the registration, with its transform.
 
     """
 
     def __init__(self, pair: Pair) -> None:
-        if pair.T_target_source is None:
-            raise ValueError("the pair has no transform yet")
         self.base = pair.source.cloud
-        self.pair = pair
-        self.T_target_source = pair.T_target_source
+        self._chain = TransformChain.of(pair)
         self.name = self.base.name
-        self.crs = pair.target.link.file_crs
+        self.crs = self._chain.target.file_crs
         self.count = self.base.count
-        low, high = self.base.minimum, self.base.maximum
-        corners = np.array(
-            [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
-        )
-        moved = self.move(corners)
+        axes = np.stack([self.base.minimum, self.base.maximum], axis=1)
+        moved = self.move(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
         self.minimum, self.maximum = moved.min(axis=0), moved.max(axis=0)
 
     def move(self, xyz: Floats) -> Floats:
         """Take (n, 3) source file coordinates to (n, 3) target file coordinates."""
-        work = geometry.apply(self.T_target_source, self.pair.source.link.to_work(xyz))
-        return self.pair.target.link.to_file(work)
+        return self._chain.forward(xyz)
 
     def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
         """Yield (n, 3) float64 coordinates in the target's CRS and units, n <= size."""
@@ -163,5 +155,5 @@ class Moved(Cloud):
         """Yield tables of all dimensions by PDAL name, n <= size rows each."""
         for table in self.base.table_chunks(size):
             xyz = self.move(xyz_of(table))
-            moved: Mapping[str, NDArray[np.generic]] = {axis: xyz[:, i] for i, axis in enumerate("XYZ")}
+            moved: PointTable = {axis: xyz[:, i] for i, axis in enumerate("XYZ")}
             yield {**table, **moved}
