@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from mtpcr_geo.cloud.base import Cloud
 from mtpcr_geo.errors import OptionError
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 from mtpcr_geo.scene import Bev, Pair, Side
+
+if TYPE_CHECKING:
+    from mtpcr_geo.crs import FrameLink, WorkFrame
 
 Floats = NDArray[np.float64]
 
@@ -60,7 +63,7 @@ class Level(Stage):
         if len(clouds) == 2:
             check_distinct(*clouds)
 
-    def _frames(self, target: Cloud, source: Cloud):  # type: ignore[no-untyped-def]
+    def _frames(self, target: Cloud, source: Cloud) -> tuple[WorkFrame, FrameLink, FrameLink]:
         from mtpcr_geo.crs import resolve_frames
 
         return resolve_frames(
@@ -91,7 +94,7 @@ class Level(Stage):
         frame, *links = self._frames(target, source)
         sides = []
         for role, cloud, link, looked in zip(("target", "source"), clouds, links, found, strict=False):
-            sample = link.to_work(looked.sample)
+            sample = in_work_frame(link, looked.sample)
             upright = level(sample, options.method, link.file_crs is not None, options.seed)
             self.metadata[role] = {
                 "points": looked.count,
@@ -110,6 +113,15 @@ class Level(Stage):
                 )
             )
         return Pair(sides[0], sides[-1], frame)
+
+
+def in_work_frame(link: FrameLink, xyz: Floats) -> Floats:
+    """Take (n, 3) file coordinates to work coordinates, rounded to 10 micrometres.
+
+    Far from the origin a float64 coordinate carries nanometres of noise, and points that a LAS scale puts
+    exactly on the line between two cells would fall to either side by it.
+    """
+    return np.round(link.to_work(xyz), 5)
 
 
 class BevOptions(StageOptions):
@@ -168,7 +180,7 @@ def _levelled_chunks(side: Side, context: RunContext) -> Iterator[Floats]:
 
     with context.progress.task(f"rasterising {side.cloud.name}", side.cloud.count) as advance:
         for xyz in surface_chunks(side.cloud):
-            yield geometry.apply(side.T_level_work, side.link.to_work(xyz))
+            yield geometry.apply(side.T_level_work, in_work_frame(side.link, xyz))
             advance(len(xyz))
 
 
