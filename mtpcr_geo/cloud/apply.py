@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from mtpcr_geo.cloud.las import open_cloud
 from mtpcr_geo.cloud.write import returning_scales, write_cloud
-from mtpcr_geo.crs.resolve import same_place
+from mtpcr_geo.crs.facts import same_place
 from mtpcr_geo.errors import CrsError, InputError
 from mtpcr_geo.export.files import OutputSet
 from mtpcr_geo.export.transform import read_transform

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo import geometry
-from mtpcr_geo.crs.link import FrameLink, fit_affine
+from mtpcr_geo.crs.link import FrameLink, box_points, fit_affine
 
 if TYPE_CHECKING:
     from mtpcr_geo.scene import Pair
@@ -23,7 +23,7 @@ class TransformChain:
 
     Attributes:
         source: between source file coordinates and source work coordinates.
-        target: between target file coordinates and target work coordinates.
+        target: between target work coordinates and those of the target's file, or of the CRS asked for.
         T_target_source: 4x4 rigid transform in work coordinates, metres.
         pivot: (3,) centroid of the source, in source file coordinates.
         bounds: (2, 3) of the source, in source file coordinates.
@@ -51,7 +51,7 @@ class TransformChain:
         centre = sample.mean(axis=0) if len(sample) else np.zeros(3)
         return cls(
             source=link,
-            target=pair.target.link,
+            target=pair.frame.output or pair.target.link,
             T_target_source=np.asarray(pair.T_target_source, np.float64),
             pivot=link.to_file(centre[None])[0],
             bounds=np.stack([cloud.minimum, cloud.maximum]).astype(np.float64),
@@ -97,9 +97,3 @@ class TransformChain:
     def rotation_in_files(self) -> Floats:
         """(3, 3) linear part of the 4x4, which turns about `pivot` without any far origin in the sums."""
         return self.T_file[:3, :3]
-
-
-def box_points(bounds: Floats, steps: int = 5) -> Floats:
-    """Give a grid of points over a box, (steps**3, 3), its corners among them."""
-    axes = [np.linspace(low, high, steps) for low, high in np.asarray(bounds).T]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -25,11 +25,13 @@ class WorkFrame:
     Attributes:
         crs: the projected metric CRS, or None for a local frame in metres.
         origin: (3,) whole metres, subtracted from CRS coordinates.
+        output: the way from the target's work coordinates to a CRS asked for, where that is not the target's.
 
     """
 
     crs: CRS | None
     origin: Floats
+    output: FrameLink | None = None
 
 
 @dataclass(frozen=True)
@@ -175,3 +177,9 @@ def fit_affine(move: Callable[[Floats], Floats], bounds: Floats, steps: int = 5)
     T[:3, :3] = A / half
     T[:3, 3] = centre - T[:3, :3] @ middle
     return T, worst
+
+
+def box_points(bounds: Floats, steps: int = 5) -> Floats:
+    """Give a grid of points over a box, (steps**3, 3), its corners among them."""
+    axes = [np.linspace(low, high, steps) for low, high in np.asarray(bounds).T]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -1,13 +1,16 @@
-"""Settling in which frame two clouds are registered."""
+"""Settling in which frame two clouds are registered, and how each comes there and back."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo.crs.link import FrameLink, WorkFrame
+from mtpcr_geo.crs.facts import CrsFacts, facts_of, metric, same_datum, same_heights, same_place, unbound
+from mtpcr_geo.crs.link import FrameLink, WorkFrame, box_points, run_pipeline
+from mtpcr_geo.crs.operation import area_of, best_operation, local_projection
 from mtpcr_geo.errors import CrsError, InputError
 
 if TYPE_CHECKING:
@@ -16,8 +19,9 @@ if TYPE_CHECKING:
     from mtpcr_geo.cloud.base import Cloud
 
 Floats = NDArray[np.float64]
+Vertical = Literal["refuse", "assume-same", "estimate"]
 LOCAL = "local"
-FARTHEST_APART = 100_000.0  # metres between the bounds of two clouds that claim the same CRS
+FARTHEST_APART = 100_000.0  # metres between the bounds of two clouds that both claim a place on earth
 
 
 def parse_crs(text: str) -> CRS | None:
@@ -50,11 +54,15 @@ def resolve_frames(
     target_crs: str | CRS | None = None,
     source_crs: str | CRS | None = None,
     local: bool = False,
+    vertical: Vertical = "refuse",
+    out_crs: str | CRS | None = None,
 ) -> tuple[WorkFrame, FrameLink, FrameLink]:
     """Settle in which frame two clouds are registered, and how each comes there.
 
-    Each side is shifted by an origin of its own, whole metres near the middle of its bounds, so that a
-    shift of a file by whole metres changes nothing in its work coordinates.
+    The work frame is the target's projection in metres, or for geographic and geocentric targets a
+    transverse Mercator of true scale in their middle; its heights are the target's, in metres. The source
+    comes there by the best operation that PROJ has. Each side is shifted by an origin of its own, whole
+    metres near the middle of its bounds, so that a shift of a file by whole metres changes nothing.
 
     Args:
         target: the cloud that stays; its CRS is what its file or reader states.
@@ -62,29 +70,34 @@ def resolve_frames(
         target_crs: what the user says of the target instead: a CRS, its text, or "local".
         source_crs: what the user says of the source instead.
         local: both clouds are local, in metres, whatever the files say.
+        vertical: what to do where heights have different or unknown datums: "refuse"; "assume-same" takes
+            them as equal; "estimate" takes them as they are and leaves the offset to the registration.
+        out_crs: CRS of the result where it shall not be the target's.
 
     Returns:
-        The work frame, the target's link, the source's link.
+        The work frame (with the way out to `out_crs` as its `output`), the target's and the source's link.
 
     Raises:
-        CrsError: if a CRS is missing, not handled, or the two do not go together.
+        CrsError: if a CRS is missing or not handled, a grid is missing, or the two do not go together.
         InputError: if the bounds make no sense.
 
     """
-    target_side = None if local else _claimed(target, target_crs, "target")
-    source_side = None if local else _claimed(source, source_crs, "source")
-    for cloud, crs in ((target, target_side), (source, source_side)):
-        if crs is not None:
-            _require_projected_metric(cloud, crs)
-    target_origin, source_origin = _origin(target), _origin(source)
-    if target_side is not None and source_side is not None:
-        _require_same(target_side, source_side)
-        _require_near(target, source)
-    return (
-        WorkFrame(target_side, target_origin),
-        FrameLink(target_side, target_origin),
-        FrameLink(source_side, source_origin),
-    )
+    target_facts = facts_of(None if local else _claimed(target, target_crs, "target"))
+    source_facts = facts_of(None if local else _claimed(source, source_crs, "source"))
+    target_bounds, source_bounds = _bounds(target), _bounds(source)
+
+    work = _work_crs(target_facts, target_bounds)
+    target_link = _link(target_facts, work, target_facts, target_bounds, "assume-same")
+    if target_facts.kind == "local" or source_facts.kind == "local":
+        source_work = _work_crs(source_facts, source_bounds)
+        source_link = _link(source_facts, source_work, source_facts, source_bounds, "assume-same")
+    else:
+        source_link = _link(source_facts, work, target_facts, source_bounds, vertical)
+        _require_near(target_link, source_link)
+    frame = WorkFrame(None if work is None else unbound(work), target_link.origin)
+    if out_crs is not None:
+        frame = replace(frame, output=_output(out_crs, frame, target_link, target_facts, vertical))
+    return frame, target_link, source_link
 
 
 def _claimed(cloud: Cloud, said: str | CRS | None, role: str) -> CRS | None:
@@ -101,47 +114,143 @@ def _claimed(cloud: Cloud, said: str | CRS | None, role: str) -> CRS | None:
     return crs
 
 
-def _require_projected_metric(cloud: Cloud, crs: CRS) -> None:
-    if not crs.is_projected:
-        raise CrsError(
-            f"{cloud.name} is in {crs.name}, which is not a projected system; "
-            "reproject it to one in metres first"
-        )
-    units = {axis.unit_name for axis in crs.axis_info}
-    if units != {"metre"}:
-        names = ", ".join(sorted(units))
-        raise CrsError(f"{cloud.name} is in {crs.name} with units {names}; reproject it to metres first")
-
-
-def same_place(one: CRS, other: CRS) -> bool:
-    """Tell whether the same coordinates mean the same place in two CRSs, however their WKT is written."""
-    if one.equals(other, ignore_axis_order=True):
-        return True
-    code = one.to_epsg()
-    return code is not None and code == other.to_epsg()
-
-
-def _require_same(target: CRS, source: CRS) -> None:
-    if not same_place(target, source):
-        raise CrsError(
-            f"the target is in {target.name} and the source in {source.name}; reproject one of them first, "
-            "or say with --target-crs or --source-crs what they are"
-        )
-
-
-def _origin(cloud: Cloud) -> Floats:
-    if not (np.isfinite(cloud.minimum).all() and np.isfinite(cloud.maximum).all()):
+def _bounds(cloud: Cloud) -> Floats:
+    bounds = np.stack([cloud.minimum, cloud.maximum]).astype(np.float64)
+    if not np.isfinite(bounds).all():
         raise InputError(f"{cloud.name} has bounds that are not finite; check its header")
-    middle = (cloud.minimum + cloud.maximum) / 2
+    return bounds
+
+
+def _work_crs(facts: CrsFacts, bounds: Floats) -> CRS | None:
+    from pyproj.crs import BoundCRS
+
+    if facts.horizontal is None:
+        return None
+    if facts.kind == "projected":
+        return metric(facts.horizontal)
+    area = area_of(facts, box_points(bounds, 2))
+    if area is None:
+        raise CrsError(
+            f"coordinates like {bounds[0].tolist()} are no place in {facts.name}; check the CRS, "
+            "or whether x and y are swapped"
+        )
+    made = local_projection(facts, area)
+    bound = facts.horizontal
+    return BoundCRS(made, bound.target_crs, bound.coordinate_operation) if bound.is_bound else made
+
+
+def _link(
+    facts: CrsFacts, work: CRS | None, heights: CrsFacts, bounds: Floats, vertical: Vertical
+) -> FrameLink:
+    """Find the way from a cloud's CRS to the horizontal work CRS and the heights of another CRS."""
+    factor = np.array([facts.unit, facts.unit, facts.height_unit])
+    pipeline: str | None = None
+    report: dict[str, Any] = {"operation": "units only", "accuracy_m": 0.0, "grids": []}
+    notes = _unit_notes(facts)
+    if work is not None and facts.horizontal is not None:
+        agree = _heights_agree(facts, heights, vertical, notes)
+        start, end, solid = _ends(facts, work, heights, agree)
+        if solid or facts.kind != "projected" or not same_place(metric(facts.horizontal), work):
+            operation = best_operation(start, end, area_of(facts, box_points(bounds, 2)))
+            pipeline, report = operation.pipeline, operation.report
+            factor = np.ones(3) if solid else np.array([1.0, 1.0, facts.height_unit])
+    if factor[:2].tolist() == [1.0, 1.0] and factor[2] == 1.0 and pipeline is None:
+        report["operation"] = "none: the file is in the work frame's metres"
+    report |= {"heights": facts.height_name, "vertical": vertical, "notes": notes}
+    link = FrameLink(facts.crs, np.zeros(3), factor, pipeline, bounds, report)
+    return replace(link, origin=_origin(link, bounds))
+
+
+def _ends(facts: CrsFacts, work: CRS, heights: CrsFacts, agree: bool) -> tuple[CRS, CRS, bool]:
+    """Give the two CRSs between which PROJ works, and whether heights go through it too."""
+    from pyproj.crs import CompoundCRS
+
+    if facts.crs is None or facts.horizontal is None:
+        raise ValueError("a local frame has no coordinate operations")
+    work_or_bound, work = work, unbound(work)
+    if agree and facts.kind != "geocentric":
+        return facts.horizontal, work_or_bound, False
+    if heights.height == "datum" and heights.vertical is not None and not agree:
+        level = metric(heights.vertical)
+        return facts.crs, CompoundCRS(f"{work.name} + {level.name}", components=[work, level]), True
+    return facts.crs, work.to_3d(), True
+
+
+def _heights_agree(facts: CrsFacts, other: CrsFacts, vertical: Vertical, notes: list[str]) -> bool:
+    """Tell whether heights can be taken over as they are; note why, or refuse.
+
+    Raises:
+        CrsError: if the datums differ in a way that no operation can settle.
+
+    """
+    if same_heights(facts, other):
+        return facts.height != "ellipsoidal" or same_datum(facts, other)
+    if vertical != "refuse":
+        how = "taken as equal" if vertical == "assume-same" else "their offset is left to the registration"
+        notes.append(f"heights differ in kind ({facts.height_name}; {other.height_name}): {how}")
+        return True
+    if "unsaid" in (facts.height, other.height):
+        raise CrsError(
+            f"heights do not go together: {facts.height_name} in {facts.name}, "
+            f"{other.height_name} in {other.name}; name a CRS with its vertical part (such as EPSG:7415), "
+            "or say --vertical assume-same or --vertical estimate"
+        )
+    return False
+
+
+def _unit_notes(facts: CrsFacts) -> list[str]:
+    if facts.crs is None or facts.height != "unsaid" or facts.kind == "local":
+        return []
+    return [f"the CRS states no unit of height: taken as {facts.height_unit_name}"]
+
+
+def _origin(link: FrameLink, bounds: Floats) -> Floats:
+    if link.pipeline is None:
+        corners = np.asarray(bounds * link.factor)
+    else:
+        corners = link.to_work(box_points(bounds, 3))
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     # the odd fraction keeps bounds on a decimal grid off the rounding edge, where a far shift could flip it
     return np.asarray(np.floor(middle + 0.123456))
 
 
-def _require_near(target: Cloud, source: Cloud) -> None:
-    gap = np.maximum(target.minimum - source.maximum, source.minimum - target.maximum)[:2]
-    distance = float(np.linalg.norm(np.maximum(gap, 0.0)))
+def _require_near(target: FrameLink, source: FrameLink) -> None:
+    boxes = []
+    for link in (target, source):
+        if link.bounds is None:
+            continue
+        corners = link.to_work(box_points(link.bounds, 3))[:, :2] + link.origin[:2]
+        boxes.append((corners.min(axis=0), corners.max(axis=0)))
+    (low, high), (other_low, other_high) = boxes
+    gap = np.maximum(np.maximum(low - other_high, other_low - high), 0.0)
+    distance = float(np.linalg.norm(gap))
     if distance > FARTHEST_APART:
         raise CrsError(
-            f"source and target claim the same CRS and lie {distance / 1000:.0f} km apart; check that they "
-            "show the same place, or say --source-crs local if the source's coordinates are not in it"
+            f"by their CRSs, source and target lie {distance / 1000:.0f} km apart; check that they show the "
+            "same place, or say --source-crs local if the source's coordinates are not in its CRS"
         )
+
+
+def _output(
+    said: str | CRS, frame: WorkFrame, target: FrameLink, target_facts: CrsFacts, vertical: Vertical
+) -> FrameLink:
+    """Find the way from the target's work coordinates to a CRS that the user wants."""
+    crs = parse_crs(said) if isinstance(said, str) else said
+    if crs is None or frame.crs is None or target_facts.horizontal is None or target.bounds is None:
+        raise CrsError(
+            "--out-crs needs a target with a coordinate reference system, and one to go to; "
+            "leave it out, or give --target-crs"
+        )
+    if target_facts.crs is not None and same_place(crs, target_facts.crs):
+        return target
+    facts = facts_of(crs)
+    if facts.horizontal is None:
+        raise CrsError(f"--out-crs {crs.name} is no place on earth; name a projected or geographic system")
+    area = area_of(target_facts, box_points(target.bounds, 2))
+    there = best_operation(frame.crs, facts.horizontal, area)
+    corners = target.to_work(box_points(target.bounds, 3)) + target.origin
+    if there.pipeline is not None:
+        corners = run_pipeline(there.pipeline, corners)
+    corners[:, 2] /= facts.height_unit
+    bounds = np.stack([corners.min(axis=0), corners.max(axis=0)])
+    return replace(_link(facts, frame.crs, target_facts, bounds, vertical), origin=target.origin)

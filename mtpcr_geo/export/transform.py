@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mtpcr_geo import geometry
 from mtpcr_geo.crs.chain import TransformChain
+from mtpcr_geo.crs.facts import facts_of
 from mtpcr_geo.crs.link import FrameLink
 from mtpcr_geo.errors import InputError
 
@@ -58,7 +59,7 @@ def write_transform_json(path: str | Path, pair: Pair) -> None:
             "linear": T[:3, :3],
             "note": "target = linear (x - source pivot) + target pivot loses no digits far from the origin",
         },
-        "motion": _motion(chain),
+        "motion": _motion(chain, work is not None and pair.source.link.file_crs is not None),
         "work": {
             "crs": _crs(work),
             "units": "metre",
@@ -204,23 +205,30 @@ def _example(pair: Pair, chain: TransformChain) -> Floats:
     return chain.source.to_file(sample[:1])[0] if len(sample) else chain.pivot
 
 
-def _motion(chain: TransformChain) -> dict[str, Any]:
+def _motion(chain: TransformChain, georeferenced: bool) -> dict[str, Any]:
     R = chain.T_target_source[:3, :3]
-    return {
+    motion: dict[str, Any] = {
         "rotation_deg": float(np.degrees(geometry.rotation_angle(R))),
         "yaw_deg": float(np.degrees(geometry.yaw_of(R))),
         "tilt_deg": float(np.degrees(np.arctan2(np.hypot(R[0, 2], R[1, 2]), R[2, 2]))),
         "note": "in the work frame; yaw counter-clockwise seen from above",
     }
+    if georeferenced:
+        before = chain.source.to_work(chain.pivot[None])
+        after = geometry.apply(chain.T_target_source, before)
+        origins = chain.target.origin - chain.source.origin
+        motion["shift_of_pivot_m"] = (after - before)[0] + origins
+        motion["vertical"] = chain.source.report.get("vertical", "")
+        if motion["vertical"] == "estimate":
+            motion["vertical_offset_m"] = float(motion["shift_of_pivot_m"][2])
+    return motion
 
 
 def _units(link: FrameLink) -> list[str]:
     if link.file_crs is None:
         return ["metre"] * 3
-    names = [axis.unit_name for axis in link.file_crs.axis_info]
-    if len(names) < 3:
-        names.append("metre" if link.factor[2] == 1.0 else f"{link.factor[2]:.17g} metre")
-    return names[:3]
+    facts = facts_of(link.file_crs)
+    return [facts.unit_name, facts.unit_name, facts.height_unit_name]
 
 
 def _crs(crs: CRS | None) -> dict[str, Any] | None:

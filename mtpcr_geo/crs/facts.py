@@ -1,0 +1,249 @@
+"""What a coordinate reference system says about the numbers in a file: kind, units, height, datum."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Literal
+
+from mtpcr_geo.errors import CrsError
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+Kind = Literal["projected", "geographic", "geocentric", "local"]
+Height = Literal["datum", "ellipsoidal", "unsaid"]
+
+
+@dataclass(frozen=True)
+class CrsFacts:
+    """A CRS, taken apart.
+
+    Attributes:
+        crs: the whole CRS, or None for local metres.
+        kind: what its horizontal part is; engineering systems are local.
+        horizontal: the horizontal part, two axes; a bound one keeps its shift parameters. None if local.
+        unit: metres a horizontal unit (projected, geocentric, local), or degrees a unit (geographic).
+        unit_name: of the horizontal unit.
+        height: heights above a named vertical datum, above the ellipsoid, or nothing said.
+        vertical: the vertical CRS where there is one.
+        height_unit: metres a unit of height.
+        height_unit_name: of the unit of height.
+
+    """
+
+    crs: CRS | None
+    kind: Kind
+    horizontal: CRS | None
+    unit: float
+    unit_name: str
+    height: Height
+    vertical: CRS | None
+    height_unit: float
+    height_unit_name: str
+
+    @property
+    def name(self) -> str:
+        """What to call it in messages."""
+        return "local coordinates" if self.crs is None else self.crs.name
+
+    @property
+    def height_name(self) -> str:
+        """What its heights refer to, in words."""
+        if self.vertical is not None:
+            return str(self.vertical.name)
+        if self.height == "ellipsoidal":
+            return "ellipsoidal height"
+        return "heights of no stated datum"
+
+
+def facts_of(crs: CRS | None) -> CrsFacts:
+    """Take a CRS apart; None means local metres.
+
+    Raises:
+        CrsError: if it is of a kind, or has axes, that cannot be handled.
+
+    """
+    if crs is None:
+        return CrsFacts(None, "local", None, 1.0, "metre", "unsaid", None, 1.0, "metre")
+    horizontal, vertical = _parts(crs)
+    plain = unbound(horizontal)
+    axes = plain.axis_info
+    if plain.is_geocentric:
+        unit = _factor(axes[0])
+        return CrsFacts(
+            crs,
+            "geocentric",
+            horizontal,
+            unit,
+            axes[0].unit_name,
+            "ellipsoidal",
+            None,
+            unit,
+            axes[0].unit_name,
+        )
+    kind: Kind = "projected" if plain.is_projected else "geographic" if plain.is_geographic else "local"
+    if kind == "local" and plain.type_name != "Engineering CRS":
+        raise CrsError(
+            f"{crs.name} is a {plain.type_name}, in which clouds cannot be registered; "
+            "name a projected, geographic, geocentric or local system"
+        )
+    _check_axes(crs.name, axes[:2])
+    unit, unit_name = _factor(axes[0]), axes[0].unit_name
+    if kind == "geographic":
+        unit *= 180.0 / 3.141592653589793
+    height: Height = "unsaid"
+    height_unit, height_unit_name = (1.0, "metre") if kind == "geographic" else (unit, unit_name)
+    if vertical is not None:
+        axis = unbound(vertical).axis_info[0]
+        if axis.direction.lower() != "up":
+            raise CrsError(f"{vertical.name} counts {axis.direction}, not up; reproject the heights first")
+        height, height_unit, height_unit_name = "datum", _factor(axis), axis.unit_name
+    elif len(axes) == 3:
+        height = "unsaid" if kind == "local" else "ellipsoidal"
+        height_unit, height_unit_name = _factor(axes[2]), axes[2].unit_name
+    if len(axes) == 3 and kind != "local":
+        horizontal = horizontal.to_2d()
+    return CrsFacts(
+        crs=crs,
+        kind=kind,
+        horizontal=None if kind == "local" else horizontal,
+        unit=unit,
+        unit_name=unit_name,
+        height=height,
+        vertical=vertical,
+        height_unit=height_unit,
+        height_unit_name=height_unit_name,
+    )
+
+
+def unbound(crs: CRS) -> CRS:
+    """Give the CRS without the shift to another datum that a bound one carries."""
+    return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
+
+
+def metric(crs: CRS) -> CRS:
+    """Give the same projected or vertical CRS in metres; itself if it is. A bound one stays bound."""
+    from pyproj import CRS
+    from pyproj.crs import BoundCRS
+
+    plain = unbound(crs)
+    if plain is not crs:
+        rewritten = metric(plain)
+        return crs if rewritten is plain else BoundCRS(rewritten, crs.target_crs, crs.coordinate_operation)
+    if all(abs(_factor(axis) - 1.0) < 1e-15 for axis in plain.axis_info):
+        return plain
+    data: dict[str, Any] = plain.to_json_dict()
+    for axis in data["coordinate_system"]["axis"]:
+        axis["unit"] = "metre"
+    data.pop("id", None)
+    data["name"] = f"{plain.name} in metres"
+    return CRS.from_json_dict(data)
+
+
+def same_place(one: CRS, other: CRS) -> bool:
+    """Tell whether the same coordinates mean the same place in two CRSs, however their WKT is written."""
+    if one.equals(other, ignore_axis_order=True):
+        return True
+    code = one.to_epsg()
+    if code is not None and code == other.to_epsg():
+        return True
+    try:
+        return _signature(facts_of(one)) == _signature(facts_of(other))
+    except CrsError:
+        return False
+
+
+def same_heights(one: CrsFacts, other: CrsFacts) -> bool:
+    """Tell whether two CRSs count heights from the same surface, whatever their units."""
+    if one.height != other.height:
+        return False
+    if one.vertical is None or other.vertical is None:
+        return one.vertical is other.vertical
+    return _vertical_datum(one.vertical) == _vertical_datum(other.vertical)
+
+
+def same_datum(one: CrsFacts, other: CrsFacts) -> bool:
+    """Tell whether two CRSs rest on the same geodetic datum."""
+    if one.horizontal is None or other.horizontal is None:
+        return False
+    return _datum(one.horizontal) == _datum(other.horizontal)
+
+
+@lru_cache(maxsize=64)
+def _signature(facts: CrsFacts) -> tuple[Any, ...]:
+    """Reduce a CRS to what decides about places: projection with its parameters in metres, datum, units."""
+    common = (
+        facts.kind,
+        f"{facts.unit:.12g}",
+        facts.height,
+        f"{facts.height_unit:.12g}",
+        None if facts.vertical is None else _vertical_datum(facts.vertical),
+    )
+    if facts.horizontal is None:
+        return common
+    plain = unbound(facts.horizontal)
+    operation = plain.coordinate_operation if plain.is_projected else None
+    parameters: tuple[Any, ...] = ()
+    if operation is not None:
+        # ten micrometres or 1e-10 degrees: how different writers round false origins in feet
+        parameters = (
+            _letters(operation.method_name),
+            *sorted(
+                (
+                    _letters(parameter.name),
+                    _rounded(parameter.value, parameter.unit_conversion_factor),
+                )
+                for parameter in operation.params
+            ),
+        )
+    return (*common, _datum(facts.horizontal), parameters)
+
+
+def _rounded(value: Any, factor: float) -> float:
+    return round(float(value) * (factor or 1.0), 5) if isinstance(value, int | float) else 0.0
+
+
+def _datum(horizontal: CRS) -> tuple[str, str, str]:
+    plain = unbound(horizontal)
+    ellipsoid = plain.ellipsoid
+    size = "" if ellipsoid is None else f"{ellipsoid.semi_major_metre:.3f}/{ellipsoid.inverse_flattening:.6f}"
+    name = "" if plain.datum is None else _letters(plain.datum.name.removesuffix(" ensemble"))
+    meridian = plain.prime_meridian
+    return name, size, "" if meridian is None else f"{meridian.longitude:.9f}"
+
+
+def _vertical_datum(vertical: CRS) -> str:
+    plain = unbound(vertical)
+    return _letters(plain.datum.name if plain.datum is not None else plain.name)
+
+
+def _letters(text: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", text.lower())
+
+
+def _parts(crs: CRS) -> tuple[CRS, CRS | None]:
+    whole = unbound(crs) if crs.is_bound and unbound(crs).is_compound else crs
+    if not whole.is_compound:
+        return whole, None
+    horizontal, vertical, *rest = whole.sub_crs_list
+    if rest or not unbound(vertical).is_vertical:
+        raise CrsError(
+            f"{crs.name} is composed of more than a horizontal and a vertical system; name a simpler one"
+        )
+    return horizontal, vertical
+
+
+def _factor(axis: Any) -> float:
+    return float(axis.unit_conversion_factor)
+
+
+def _check_axes(name: str, axes: list[Any]) -> None:
+    directions = {axis.direction.lower() for axis in axes}
+    # polar grids have both axes pointing the same way, along two meridians
+    if directions & {"west"} or directions == {"south", "east"}:
+        raise CrsError(
+            f"the axes of {name} point {' and '.join(sorted(directions))}, which is not handled; "
+            "reproject to a system of easting and northing"
+        )
