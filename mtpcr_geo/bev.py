@@ -65,8 +65,7 @@ class Rasteriser:
     def add(self, xyz: Floats) -> None:
         """Add (n, 3) points in the grid's metres."""
         grid = self.grid
-        column = np.floor((xyz[:, 0] - grid.west) * (1.0 / grid.cell)).astype(np.int64)
-        row = np.floor((grid.north - xyz[:, 1]) * (1.0 / grid.cell)).astype(np.int64)
+        column, row = self._cells(xyz)
         inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
         cell = row * grid.width + column
         z = xyz[:, 2].astype(np.float32)
@@ -75,6 +74,13 @@ class Rasteriser:
         np.maximum.at(self._top, cell, z)
         np.minimum.at(self._low, cell, z)
         self._count += np.bincount(cell, minlength=len(self._count)).astype(np.uint32)
+
+    def _cells(self, xyz: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Give the column and the row of (n, 3) points, inside the raster or not."""
+        grid = self.grid
+        column = np.floor((xyz[:, 0] - grid.west) * (1.0 / grid.cell)).astype(np.int64)
+        row = np.floor((grid.north - xyz[:, 1]) * (1.0 / grid.cell)).astype(np.int64)
+        return column, row
 
     def finish(self) -> Bev:
         """Give the raster of everything added so far."""

@@ -7,14 +7,22 @@ show facades and eaves, which are all that a street-level scan shares with a vie
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo import paper
 from mtpcr_geo.scene import Bev
 
 Image = NDArray[np.float32]
+Grey = NDArray[np.uint8]
+Look = Literal["band_pass", "paper", "paper_normalised", "grey", "grey_printed"]
+LOOKS: tuple[Look, ...] = get_args(Look)
+
+EMPTY_GREY = 127
+GREY_PER_METRE = 20.0
 
 FINE_SIGMA_CELLS = 0.7
 WIDE_SIGMA_M = 12.0
@@ -108,3 +116,36 @@ def channels(bev: Bev) -> Channels:
     """Make the correlation channels of a height raster."""
     height, mask = filled_height(bev)
     return Channels(band_pass(height, mask, bev.grid.cell), step_edges(height, mask, bev.grid.cell), mask)
+
+
+def band_image(bev: Bev) -> Grey:
+    """Make the grey image of the band-passed height: 127 + 20 per metre, 127 where empty: (h, w) uint8.
+
+    It shows a roof of three metres alike on a hill and in a valley, and has no edge where the data end.
+    """
+    height, mask = filled_height(bev)
+    grey = EMPTY_GREY + GREY_PER_METRE * band_pass(height, mask, bev.grid.cell)
+    return np.asarray(np.clip(np.rint(grey), 0, 255), np.uint8)
+
+
+def image_of(bev: Bev, look: Look) -> Grey:
+    """Make the image that keypoint matchers see: (h, w) uint8.
+
+    Args:
+        bev: the raster.
+        look: "band_pass" (ours); "paper" (Eq. 3 corrected, Eq. 4 saturating); "paper_normalised" (Eq. 4
+            divided by the filters' sums); "grey" (Eq. 3 corrected alone); "grey_printed" (Eq. 3 as printed,
+            which is black but for the highest cell).
+
+    """
+    if look == "band_pass":
+        return band_image(bev)
+    plain = paper.grey(bev, printed=look == "grey_printed")
+    if look in ("grey", "grey_printed"):
+        return plain
+    return paper.enhance(plain, "saturated" if look == "paper" else "normalised")
+
+
+def empty_grey(look: Look) -> int:
+    """Give the grey value of empty cells in an image of that look."""
+    return EMPTY_GREY if look == "band_pass" else 0
