@@ -79,9 +79,8 @@ class RecordingWriter:
         made = _made(value, self._pair)
         if isinstance(value, Pair):
             self._log_pair(value)
-        level = rr.TextLogLevel.INFO
-        if isinstance(value, Pair) and value.verdict is not None and value.verdict.name != "accepted":
-            level = rr.TextLogLevel.WARN
+        bad = "verdict" in made and "accepted" not in made
+        level = rr.TextLogLevel.WARN if bad else rr.TextLogLevel.INFO
         line = f"{tag} ({stage_type}), {seconds:.2f} s: {made}"
         self._log("stages", rr.TextLog(line, level=level))
         self._log("seconds", rr.Scalars(seconds))

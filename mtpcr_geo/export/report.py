@@ -37,7 +37,7 @@ table{border-collapse:collapse;width:100%}
 td,th{text-align:left;vertical-align:top;padding:4px 10px 4px 0;border-bottom:1px solid var(--line)}
 th{font-weight:600}td:first-child{color:#51606d;white-space:nowrap}
 td{overflow-wrap:anywhere}
-figure{margin:0}figure img{width:100%;display:block;background:#202228}
+figure{margin:0}figure img{width:100%;max-height:640px;object-fit:contain;display:block;background:#202228}
 img.coarse{image-rendering:pixelated}
 figcaption{font-size:13px;color:#51606d;margin-top:6px}
 svg{width:100%;height:auto;display:block}
