@@ -32,7 +32,12 @@ class Pipeline:
 
     Example:
         >>> from mtpcr_geo import Pipeline
-        >>> pipeline = Pipeline('["target.laz", "source.laz", "mtpcr.register"]')  # doctest: +SKIP
+        >>> stages = ["target.laz", "source.laz", {"type": "mtpcr.register"}, {"type": "mtpcr.apply"}]
+        >>> pipeline = Pipeline([*stages, "registered.laz"])
+        >>> pipeline.execute()  # doctest: +SKIP
+        99618
+        >>> pipeline.verdict.name  # doctest: +SKIP
+        'accepted'
 
     """
 

@@ -209,10 +209,9 @@ class LasWriter(Stage):
         crs = stated_crs(self, "a_srs", self.options.a_srs) or cloud.crs
         scale = self.options.scale
         path = context.outputs.path(self.options.filename)
-        if isinstance(cloud, Moved):
-            write_cloud(path, cloud.base, cloud.move, crs, scale, progress=context.progress)
-        else:
-            write_cloud(path, cloud, None, crs, scale, progress=context.progress)
+        base, move = (cloud.base, cloud.move) if isinstance(cloud, Moved) else (cloud, None)
+        with context.progress.task(f"writing {self.options.filename.name}", cloud.count) as advance:
+            write_cloud(path, base, move, crs, scale, advance=advance)
         self.metadata |= {"filename": str(self.options.filename), "count": cloud.count}
         return cloud
 

@@ -222,7 +222,8 @@ def _spooled(cloud: Cloud, tag: str, context: RunContext) -> dict[str, Any]:
     if path is None:
         path = context.scratch() / f"{len(context.spooled)}.las"
         base, move = (cloud.base, cloud.move) if isinstance(cloud, Moved) else (cloud, None)
-        write_cloud(path, base, move, cloud.crs, progress=context.progress)
+        with context.progress.task("handing points to PDAL", cloud.count) as advance:
+            write_cloud(path, base, move, cloud.crs, advance=advance)
         context.spooled[id(cloud)] = path
     words: dict[str, Any] = {"type": "readers.las", "tag": tag, "filename": str(path)}
     if cloud.crs is not None:

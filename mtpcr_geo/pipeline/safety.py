@@ -9,14 +9,21 @@ from typing import Any
 from mtpcr_geo.errors import OptionError
 from mtpcr_geo.pipeline.grammar import StageSpec
 
-CODE_STAGES = frozenset(
-    {"filters.python", "filters.matlab", "filters.julia", "filters.streamcallback", "readers.numpy"}
-)
+CODE_STAGES = frozenset({"filters.python", "filters.matlab", "filters.julia", "readers.numpy"})
+# by connection strings, or by files that list further, possibly remote, ones
 NETWORK_STAGES = frozenset(
-    {"readers.i3s", "readers.nitf_remote", "readers.oci", "readers.pgpointcloud", "readers.sqlite",
-     "readers.stac", "readers.tiledb", "readers.tindex", "filters.mongo", "writers.oci",
-     "writers.pgpointcloud", "writers.sqlite", "writers.tiledb"}
-)  # fmt: skip
+    {
+        "readers.i3s",
+        "readers.oci",
+        "readers.pgpointcloud",
+        "readers.stac",
+        "readers.tiledb",
+        "readers.tindex",
+        "writers.oci",
+        "writers.pgpointcloud",
+        "writers.tiledb",
+    }
+)
 # options that read further options, or write, past every check
 _CLOSED = {
     "option_file": "put its options into the pipeline",
