@@ -1,5 +1,6 @@
 """Coordinate reference systems: facts, units, heights, operations, work frames."""
 
+import json
 import warnings
 
 import numpy as np
@@ -431,3 +432,45 @@ def test_output_crs_needs_a_place_on_earth():
     known = ArrayCloud(site(), UTM)
     with pytest.raises(CrsError, match="--out-crs"):
         resolve_frames(known, known, out_crs="local")
+
+
+ROUTES = [
+    ("EPSG:25833", "EPSG:25832"),
+    ("EPSG:4258", "EPSG:25832"),
+    ("EPSG:4326", "EPSG:32632"),
+    ("EPSG:4936", "EPSG:4937"),
+    ("EPSG:3034", "EPSG:25832"),
+]
+# PDAL 2.2 leaves such heights as they are; GDAL since then does not
+LEVEL_ROUTE = ("EPSG:25832+5783", "EPSG:25832+5621")
+
+
+def by_pdal(start, end, xyz):
+    pdal = pytest.importorskip("pdal", reason="PDAL is not installed")
+    array = np.zeros(len(xyz), [(axis, "<f8") for axis in "XYZ"])
+    for axis, name in enumerate("XYZ"):
+        array[name] = xyz[:, axis]
+    stage = {"type": "filters.reprojection", "in_srs": start, "out_srs": end}
+    pipeline = pdal.Pipeline(json.dumps([stage]), arrays=[array])
+    pipeline.execute()
+    return np.column_stack([pipeline.arrays[0][axis] for axis in "XYZ"])
+
+
+def by_gdal(start, end, xyz):
+    from rasterio.warp import transform
+
+    return np.column_stack(transform(start, end, *xyz.T))
+
+
+@pytest.mark.parametrize(
+    ("tool", "start", "end"),
+    [*((by_pdal, *r) for r in ROUTES), *((by_gdal, *r) for r in (*ROUTES, LEVEL_ROUTE))],
+)
+def test_operations_agree_with_other_tools(tool, start, end):
+    first, last = CRS.from_user_input(start), CRS.from_user_input(end)
+    xyz = site(50) if first.is_compound else written_in(first, 1.0, site(50)).xyz
+    theirs = tool(start, end, xyz)
+    _, target_link, source_link = resolve_frames(ArrayCloud(theirs, last), ArrayCloud(xyz, first))
+    ours = source_link.to_work(xyz) + source_link.origin
+    assert np.allclose(ours, target_link.to_work(theirs) + target_link.origin, rtol=0, atol=0.001)
+    assert np.allclose(target_link.to_file(ours - target_link.origin)[:, 2], theirs[:, 2], rtol=0, atol=0.001)
