@@ -7,6 +7,7 @@ show facades and eaves, which are all that a street-level scan shares with a vie
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, get_args
 
 import cv2
@@ -107,8 +108,9 @@ class Channels:
     steps: Image
     mask: Image
 
+    @cached_property
     def stack(self) -> Image:
-        """Give (3, h, w): height, steps, mask."""
+        """All three as one (3, h, w) array: height, steps, mask."""
         return np.stack([self.height, self.steps, self.mask])
 
 

@@ -18,6 +18,7 @@ Method = Literal["gicp", "point_to_plane", "point_to_point", "none"]
 _SMALL_GICP_NAMES = {"gicp": "GICP", "point_to_plane": "PLANE_ICP", "point_to_point": "ICP"}
 FEWEST_POINTS = 200
 FIRST_REACH_M = 3.0
+MOST_CUBES = 30_000_000
 STILL_RAD = 2e-5
 STILL_M = 5e-4
 FEWEST_GROUND_CELLS = 30
@@ -133,15 +134,18 @@ def icp(
 
 def _near(points: Floats, others: Floats, reach: float) -> NDArray[np.bool_]:
     """Tell which points may have one of the others within reach, by cubes of that edge."""
-    from scipy.ndimage import binary_dilation
-
     (low_p, high_p), (low_o, high_o) = geometry.bounds(points), geometry.bounds(others)
-    low = np.minimum(low_p, low_o) - 2 * reach
-    shape = np.floor((np.maximum(high_p, high_o) - low) / reach).astype(int) + 2
+    span = np.maximum(high_p, high_o) - np.minimum(low_p, low_o)
+    edge = max(reach, float(np.cbrt(np.prod(span + 4 * reach) / MOST_CUBES)))
+    low = np.minimum(low_p, low_o) - 2 * edge
+    shape = np.floor(span / edge).astype(int) + 5
     filled = np.zeros(tuple(shape.tolist()), dtype=np.bool_)
-    filled[tuple(np.floor((others - low) / reach).astype(np.int64).T)] = True
-    near = binary_dilation(filled, np.ones((3, 3, 3), np.bool_))
-    return np.asarray(near[tuple(np.floor((points - low) / reach).astype(np.int64).T)])
+    filled[tuple(np.floor((others - low) / edge).astype(np.int64).T)] = True
+    for axis in range(3):
+        # cubes beside a filled one along each axis in turn: all 26 neighbours in the end
+        ahead, behind = np.roll(filled, 1, axis), np.roll(filled, -1, axis)
+        filled = filled | ahead | behind
+    return np.asarray(filled[tuple(np.floor((points - low) / edge).astype(np.int64).T)])
 
 
 def _at_most(cloud: Any, most: int) -> Floats:

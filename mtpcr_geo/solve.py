@@ -91,14 +91,7 @@ def ransac_upright(
     if not len(first):
         return np.eye(4), np.zeros(n, bool)
     yaw = np.arctan2(ds[:, 0] * dt[:, 1] - ds[:, 1] * dt[:, 0], (ds * dt).sum(axis=1))
-    best, best_count = np.zeros(n, bool), -1
-    for angle, i in zip(yaw, first, strict=True):
-        c, r = np.cos(angle), np.sin(angle)
-        moved = (s - s[i]) @ np.array([[c, r], [-r, c]]) + t[i]
-        inlier = ((moved - t) ** 2).sum(axis=1) < tolerance**2
-        count = int(inlier.sum())
-        if count > best_count:
-            best, best_count = inlier, count
+    best = _most_agreed(s, t, yaw, first, tolerance)
     T = fit_upright(s[best], t[best])
     for _ in range(5):
         residual = np.hypot(*(geometry.apply(T, _planar(s))[:, :2] - t).T)
@@ -108,6 +101,27 @@ def ransac_upright(
         best = inlier
         T = fit_upright(s[best], t[best])
     return T, best
+
+
+def _most_agreed(s: Floats, t: Floats, yaw: Floats, anchor: NDArray[np.int64], tolerance: float) -> Mask:
+    """Mark the ties that agree with the best of many poses, each a yaw about a tie that it maps exactly."""
+    best, best_count = np.zeros(len(s), bool), -1
+    # a few million numbers at a time
+    step = max(1, 2_000_000 // len(s))
+    for start in range(0, len(yaw), step):
+        c, r = np.cos(yaw[start : start + step, None]), np.sin(yaw[start : start + step, None])
+        i = anchor[start : start + step]
+        east = c * s[:, 0] - r * s[:, 1] - t[:, 0]
+        north = r * s[:, 0] + c * s[:, 1] - t[:, 1]
+        rows = np.arange(len(i))
+        east -= east[rows, i][:, None]
+        north -= north[rows, i][:, None]
+        agree = east * east + north * north < tolerance**2
+        counts = agree.sum(axis=1)
+        k = int(np.argmax(counts))
+        if counts[k] > best_count:
+            best, best_count = agree[k], int(counts[k])
+    return best
 
 
 def _planar(xy: Floats) -> Floats:

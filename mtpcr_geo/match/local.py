@@ -59,8 +59,8 @@ def match_patches(
 
     """
     grid = target.grid
-    stack = target.channels.stack()
-    warped = warp_to(source.channels.stack(), source.grid, grid, pose)
+    stack = target.channels.stack
+    warped = warp_to(source.channels.stack, source.grid, grid, pose)
     mask = (warped[2] > FILLED).astype(np.float32)
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):

@@ -82,7 +82,7 @@ class GlobalSearch:
         self._turned_side = side
         height, width = target.grid.shape
         self._shape = tuple(scipy.fft.next_fast_len(n + side - 1, real=True) for n in (height, width))
-        self._target_spectra = self._spectra(target.channels.stack())
+        self._target_spectra = self._spectra(target.channels.stack)
 
     def _spectra(self, stack: Image) -> Spectrum:
         """Transform height, steps, mask and the squares of the first two: (5, ...)."""
@@ -94,7 +94,7 @@ class GlobalSearch:
         grid = self.source.grid
         side, half = self._turned_side, self._turned_side * grid.cell / 2
         square = Grid(-half, half, grid.cell, side, side)
-        stack = warp_to(self.source.channels.stack(), grid, square, Pose(yaw, 0.0, 0.0))
+        stack = warp_to(self.source.channels.stack, grid, square, Pose(yaw, 0.0, 0.0))
         mask = (stack[2] > FILLED).astype(np.float32)
         return np.stack([stack[0] * mask, stack[1] * mask, mask]), square
 
@@ -185,14 +185,14 @@ def score_nearby(source: Layer, target: Layer, pose: Pose, window: int) -> tuple
     nothing = np.full((side, side), -np.inf, np.float32)
     if part.width <= 2 * window or part.height <= 2 * window:
         return Pose(pose.yaw, pose.east, pose.north, -np.inf, 0), nothing
-    warped = warp_to(source.channels.stack(), source.grid, part, pose)
+    warped = warp_to(source.channels.stack, source.grid, part, pose)
     inner = (slice(window, part.height - window), slice(window, part.width - window))
     mask = (warped[2] > FILLED).astype(np.float32)[inner]
     a, e = (warped[0][inner] * mask).ravel(), (warped[1][inner] * mask).ravel()
     m = mask.ravel()
     row0, column0 = offset
     rows, columns = inner[0].stop - window, inner[1].stop - window
-    stack = target.channels.stack()[:, row0 : row0 + part.height, column0 : column0 + part.width]
+    stack = target.channels.stack[:, row0 : row0 + part.height, column0 : column0 + part.width]
     sums = np.empty((7, side, side), np.float32)
     aa, ee = a * a, e * e
     for dy in range(side):
