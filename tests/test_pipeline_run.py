@@ -40,7 +40,8 @@ def test_register_brings_the_source_home_and_leaves_everything(registered):
     assert yaw == pytest.approx(61.0, abs=0.1)
     names = {str(path.relative_to(out)) for path in files_below(out)}
     assert names == {
-        "bev/source.tif", "bev/target.tif", "ties.gpkg", "transform.json", "transform.cloudcompare.txt",
+        "bev/source.tif", "bev/target.tif", "bev/registered.tif", "ties.gpkg", "transform.json",
+        "transform.cloudcompare.txt",
         "transform.pdal.json", "audit.rrd", "report.html", "run.json", "registered.laz",
     }  # fmt: skip
 

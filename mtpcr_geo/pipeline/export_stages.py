@@ -92,14 +92,15 @@ class WriteBev(EvidenceWriter):
         """Options of mtpcr.write_bev."""
 
         filename: Path = Field(
-            description="file to write; a # in it stands for 'source' and 'target', two files"
+            description="file to write; a # in it stands for 'source', 'target' and, once the pair is solved, "
+            "'registered': the source's raster laid over the target's"
         )
 
     def writes(self) -> list[Path]:
         """Name both files, or the one."""
         if "#" not in self.options.filename.name:
             return [self.options.filename]
-        return [self._file(role) for role in ("source", "target")]
+        return [self._file(role) for role in ("source", "target", "registered")]
 
     def missing(self, pair: Pair, context: RunContext) -> str | None:
         """Need a raster."""
@@ -107,7 +108,7 @@ class WriteBev(EvidenceWriter):
 
     def write(self, pair: Pair, context: RunContext) -> None:
         """Write a GeoTIFF for each side that has a raster."""
-        from mtpcr_geo.export.raster import write_side_bev
+        from mtpcr_geo.export.raster import write_registered_bev, write_side_bev
 
         sides = [side for side in self._sides(pair) if side.bev is not None]
         if len(sides) > 1 and "#" not in self.options.filename.name:
@@ -115,7 +116,9 @@ class WriteBev(EvidenceWriter):
                 f"{self.label}: two rasters are two files; write a # in the filename for the roles"
             )
         for side in sides:
-            write_side_bev(context.outputs.path(self._file(side.role)), side)
+            write_side_bev(context.outputs.path(self._file(side.role)), side, pair.frame)
+        if len(sides) > 1 and pair.T_target_source is not None and not refused(pair):
+            write_registered_bev(context.outputs.path(self._file("registered")), pair)
 
     def _file(self, role: str) -> Path:
         return self.options.filename.with_name(self.options.filename.name.replace("#", role))
