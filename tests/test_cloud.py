@@ -13,7 +13,7 @@ from pyproj import CRS
 
 from mtpcr_geo.cloud import ArrayCloud
 from mtpcr_geo.cloud.las import check_distinct, open_cloud
-from mtpcr_geo.cloud.octree import OctreeSorter, quantise
+from mtpcr_geo.cloud.octree import OctreeSorter, Spool, quantise
 from mtpcr_geo.cloud.sample import scan, surface_chunks
 from mtpcr_geo.cloud.write import is_copc, write_cloud
 from mtpcr_geo.errors import InputError, MtpcrError, OutputError
@@ -464,8 +464,10 @@ def test_octree_of_several_groups(tmp_path, monkeypatch):
     records["p"], records["id"] = rng.random((20_000, 3)) ** 2, np.arange(20_000)
     seen = []
     keys = []
-    with (tmp_path / "spool").open("w+b") as spool:
-        sorter = OctreeSorter(records, lambda part: quantise(part["p"], 1.0), lambda: spool)
+    with (tmp_path / "a").open("w+b") as first, (tmp_path / "b").open("w+b") as second:
+        spool = Spool(first, records.dtype, len(records))
+        spool.write(0, records)
+        sorter = OctreeSorter(spool, lambda part: quantise(part["p"], 1.0), lambda: second)
         for (level, *cell), points in sorter.nodes():
             keys.append((level, *cell))
             assert np.all(np.floor(points["p"] * 2**level) == cell)

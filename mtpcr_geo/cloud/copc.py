@@ -19,7 +19,7 @@ import numpy as np
 from laspy.vlrs.vlrlist import VLRList
 from numpy.typing import NDArray
 
-from mtpcr_geo.cloud.octree import Key, OctreeSorter, quantise
+from mtpcr_geo.cloud.octree import Key, OctreeSorter, Spool, quantise
 from mtpcr_geo.errors import OutputError
 
 _BATCH = 16  # nodes handed to the compressor at once, which works on them in parallel
@@ -50,7 +50,7 @@ def write_copc(path: Path, header: laspy.LasHeader, chunks: Iterable[NDArray[Any
         count = _spool(spool, header, chunks)
         if count == 0:
             raise OutputError("COPC cannot hold a cloud of no points; name the output .laz")
-        records = np.memmap(spool, header.point_format.dtype(), mode="r", shape=(count,))
+        records = Spool(spool, header.point_format.dtype(), count)
         low = np.asarray(header.mins)
         side = float((np.asarray(header.maxs) - low).max()) or 1.0
         side *= 1 + 1e-9  # the highest point lies within the cube, not on its far side

@@ -30,11 +30,38 @@ def quantise(xyz: NDArray[np.float64], side: float) -> Cells:
     return np.clip(scaled, 0, 2**_BITS - 1).astype(np.int32)
 
 
+class Spool:
+    """Records of one kind in a file, read and written by position.
+
+    Plain reads, not a memory map: the pages of a map would count as this process's memory.
+
+    Args:
+        file: open for reading and writing; stays the caller's to close.
+        dtype: of a record.
+        count: how many records it holds, or shall hold.
+
+    """
+
+    def __init__(self, file: BinaryIO, dtype: np.dtype[Any], count: int) -> None:
+        self.file, self.dtype, self.count = file, dtype, count
+
+    def read(self, start: int, count: int) -> NDArray[Any]:
+        """Read up to `count` records from position `start`: (n,), writable."""
+        count = min(count, self.count - start)
+        self.file.seek(start * self.dtype.itemsize)
+        return np.frombuffer(bytearray(self.file.read(count * self.dtype.itemsize)), self.dtype)
+
+    def write(self, start: int, records: NDArray[Any]) -> None:
+        """Write records from position `start` on."""
+        self.file.seek(start * self.dtype.itemsize)
+        self.file.write(records.tobytes())
+
+
 class OctreeSorter:
     """Gives the nodes of a cloud's octree, one after the other.
 
     Args:
-        records: the points, (n,) packed records; may be a memory map.
+        records: the points, as packed records.
         cells: gives the quantised coordinates (n, 3) of some records.
         temporary: opens a temporary file.
 
@@ -42,7 +69,7 @@ class OctreeSorter:
 
     def __init__(
         self,
-        records: NDArray[Any],
+        records: Spool,
         cells: Callable[[NDArray[Any]], Cells],
         temporary: Callable[[], BinaryIO],
     ) -> None:
@@ -59,7 +86,7 @@ class OctreeSorter:
         taken: dict[Key, NDArray[np.int64]] = {}
         start = 0
         for code, count in zip(codes.tolist(), counts.tolist(), strict=True):
-            group = np.array(records[start : start + count])
+            group = records.read(start, count)
             start += count
             # the first point of a cell is the one that is kept: without a shuffle, always that of one edge
             group = group[self.rng.permutation(count)]
@@ -80,11 +107,12 @@ class OctreeSorter:
 
     def _groups(self) -> tuple[int, NDArray[np.int64], NDArray[np.int64]]:
         """Find the level at which nodes are small enough to be held, and how many points each has."""
-        if len(self.records) <= _GROUP:
-            return 0, np.zeros(1, np.int64), np.array([len(self.records)])
+        if self.records.count <= _GROUP:
+            return 0, np.zeros(1, np.int64), np.array([self.records.count])
         tally: dict[int, int] = {}
-        for start in range(0, len(self.records), _CHUNK):
-            found = np.unique(self._codes(start, _GROUP_LEVEL), return_counts=True)
+        for start in range(0, self.records.count, _CHUNK):
+            chunk = self.records.read(start, _CHUNK)
+            found = np.unique(self._codes(chunk, _GROUP_LEVEL), return_counts=True)
             for code, count in zip(found[0].tolist(), found[1].tolist(), strict=True):
                 tally[code] = tally.get(code, 0) + count
         deep = np.array(sorted(tally), np.int64)
@@ -98,25 +126,23 @@ class OctreeSorter:
                 break
         return level, codes, counts
 
-    def _codes(self, start: int, level: int) -> NDArray[np.int64]:
-        cells = self.cells(self.records[start : start + _CHUNK]).astype(np.int64) >> _BITS - level
+    def _codes(self, records: NDArray[Any], level: int) -> NDArray[np.int64]:
+        cells = self.cells(records).astype(np.int64) >> _BITS - level
         return np.asarray(cells[:, 0] << 2 * level | cells[:, 1] << level | cells[:, 2])
 
-    def _by_group(self, level: int, codes: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[Any]:
+    def _by_group(self, level: int, codes: NDArray[np.int64], counts: NDArray[np.int64]) -> Spool:
         """Sort all records by group, into a second temporary file."""
-        file = self.temporary()
-        file.truncate(self.records.nbytes)
-        output = np.memmap(file, self.records.dtype, mode="r+", shape=self.records.shape)
+        output = Spool(self.temporary(), self.records.dtype, self.records.count)
         places = np.concatenate([[0], np.cumsum(counts)[:-1]])
-        for start in range(0, len(self.records), _CHUNK):
-            group = np.searchsorted(codes, self._codes(start, level))
-            order = np.argsort(group, kind="stable")
-            part = self.records[start : start + _CHUNK][order]
+        for start in range(0, self.records.count, _CHUNK):
+            chunk = self.records.read(start, _CHUNK)
+            group = np.searchsorted(codes, self._codes(chunk, level))
+            part = chunk[np.argsort(group, kind="stable")]
             numbers = np.bincount(group, minlength=len(codes))
             done = 0
             for index in np.flatnonzero(numbers).tolist():
                 n = int(numbers[index])
-                output[places[index] : places[index] + n] = part[done : done + n]
+                output.write(int(places[index]), part[done : done + n])
                 places[index] += n
                 done += n
         return output

@@ -37,8 +37,8 @@ def write_transform_json(path: str | Path, pair: Pair) -> None:
     chain = TransformChain.of(pair)
     work = pair.frame.crs
     T = chain.T_file
-    example = _example(pair, chain)
-    moved = chain.forward(example[None])[0]
+    examples = _examples(pair, chain)
+    moved = chain.forward(examples)
     document: dict[str, Any] = {
         "type": KIND,
         "version": VERSION,
@@ -75,11 +75,12 @@ def write_transform_json(path: str | Path, pair: Pair) -> None:
             "source_bounds": chain.bounds,
         },
         "example": {
-            "source": example,
-            "target": moved,
-            "source_again": chain.inverse(moved[None])[0],
-            "by_matrix": geometry.apply(T, example[None])[0],
+            "source": examples[0],
+            "target": moved[0],
+            "source_again": chain.inverse(moved[:1])[0],
+            "by_matrix": geometry.apply(T, examples[:1])[0],
         },
+        "more_examples": [{"source": a, "target": b} for a, b in zip(examples[1:], moved[1:], strict=True)],
         "cloudcompare": {key: value for key, value in _cloudcompare(chain).items() if key != "matrix"},
         "files": {"source": Path(pair.source.cloud.name).name, "target": Path(pair.target.cloud.name).name},
     }
@@ -199,10 +200,12 @@ def _is_rigid(T: Floats) -> bool:
     return bool(np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), rtol=0, atol=1e-12))
 
 
-def _example(pair: Pair, chain: TransformChain) -> Floats:
-    """Give one point of the source, in file coordinates, as the worked example."""
+def _examples(pair: Pair, chain: TransformChain) -> Floats:
+    """Give up to four points of the source, (n, 3) file coordinates, as worked examples."""
     sample = pair.source.sample
-    return chain.source.to_file(sample[:1])[0] if len(sample) else chain.pivot
+    if not len(sample):
+        return chain.pivot[None]
+    return chain.source.to_file(sample[np.unique(np.linspace(0, len(sample) - 1, 4).astype(int))])
 
 
 def _motion(chain: TransformChain, georeferenced: bool) -> dict[str, Any]:
