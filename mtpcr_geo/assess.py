@@ -19,6 +19,8 @@ from mtpcr_geo.scene import Verdict, VerdictName
 Floats = NDArray[np.float64]
 
 FEWEST_GROUND_CELLS = 30
+KEPT_SHARE = 0.5
+"""Share of the agreeing ties that refinement must not lose."""
 
 UNBOUNDED_CHANCE = 0.02
 """Chance agreement of a withheld tie whose matcher looks for it in the whole raster, judged generously."""
@@ -42,6 +44,7 @@ class Evidence:
         ground_cells: cells where both see the ground.
         ground_agreeing: of these, cells whose heights agree.
         refined_away_m: how far the refinement moved the overlap from the solution, metres.
+        final_agreeing: of all ties, those that agree with the final transform; None if not counted.
 
     """
 
@@ -58,6 +61,7 @@ class Evidence:
     ground_cells: int
     ground_agreeing: int
     refined_away_m: float
+    final_agreeing: int | None = None
 
 
 @dataclass(frozen=True)
@@ -116,6 +120,11 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
             )
     if evidence.refined_away_m > limits.refined_away * evidence.tolerance_m:
         doubts.append(f"the refinement went {evidence.refined_away_m:.1f} m away from where the ties had led")
+    final = evidence.final_agreeing
+    if final is not None and final < KEPT_SHARE * evidence.withheld_agreeing:
+        refusals.append(
+            f"the final transform agrees with {final} ties only, {evidence.withheld_agreeing} agreed before"
+        )
     ground = evidence.ground_agreeing / max(evidence.ground_cells, 1)
     if evidence.ground_cells >= FEWEST_GROUND_CELLS and ground < limits.ground_agreeing:
         doubts.append(f"only {ground:.0%} of the ground that both clouds see agrees in height")

@@ -11,7 +11,9 @@ class Recorder(Protocol):
     def begin(self, properties: dict[str, Any]) -> None:
         """Note what holds for the whole run: CRS, origin, file hashes, versions, options."""
 
-    def after(self, stage_type: str, tag: str, options: dict[str, Any], value: object, seconds: float) -> None:
+    def after(
+        self, stage_type: str, tag: str, options: dict[str, Any], value: object, seconds: float
+    ) -> None:
         """Note a finished stage and what it made (a `Pair`, a `Cloud` or None)."""
 
     def close(self) -> None:
@@ -24,7 +26,9 @@ class NullRecorder:
     def begin(self, properties: dict[str, Any]) -> None:
         """Keep nothing."""
 
-    def after(self, stage_type: str, tag: str, options: dict[str, Any], value: object, seconds: float) -> None:
+    def after(
+        self, stage_type: str, tag: str, options: dict[str, Any], value: object, seconds: float
+    ) -> None:
         """Keep nothing."""
 
     def close(self) -> None:

@@ -57,6 +57,29 @@ class Level(StrEnum):
     none = "none"
 
 
+class Vertical(StrEnum):
+    """What to do with different vertical datums."""
+
+    refuse = "refuse"
+    assume_same = "assume-same"
+    estimate = "estimate"
+
+
+class Prior(StrEnum):
+    """Where the search starts."""
+
+    none = "none"
+    georef = "georef"
+
+
+class Motion(StrEnum):
+    """Degrees of freedom of the result."""
+
+    rigid = "rigid"
+    yaw = "yaw"
+    translation = "translation"
+
+
 Verbose = Annotated[
     bool, typer.Option("--verbose", "-v", help="Say what every stage did and how long it took.")
 ]
@@ -99,9 +122,23 @@ def register(
     cell: Annotated[
         float | None, typer.Option(help="Cell of the height rasters in metres; chosen if not given.")
     ] = None,
+    vertical: Annotated[
+        Vertical, typer.Option(help="What to do with different or unknown vertical datums.")
+    ] = Vertical.refuse,
+    out_crs: Annotated[
+        str | None, typer.Option(help="CRS of the result, where it shall not be the target's.")
+    ] = None,
+    prior: Annotated[
+        Prior, typer.Option(help="georef: search only near where both clouds' CRSs put them.")
+    ] = Prior.none,
     no_prior: Annotated[
         bool, typer.Option("--no-prior", help="Do not use the clouds' shared georeference (the default).")
-    ] = True,
+    ] = False,
+    prior_sigma: Annotated[
+        float, typer.Option(help="With --prior: standard deviation of the source's place, metres.")
+    ] = 5.0,
+    prior_yaw: Annotated[float, typer.Option(help="With --prior: largest turn considered, degrees.")] = 5.0,
+    motion: Annotated[Motion, typer.Option(help="Degrees of freedom of the result.")] = Motion.rigid,
     profile: Annotated[str, typer.Option(help="Which set of steps and settings to run.")] = "default",
     seed: Annotated[int, typer.Option(help="Seed of everything random.")] = 0,
     overwrite: Overwrite = False,
@@ -126,7 +163,9 @@ def register(
 
     words = {
         "source_crs": source_crs, "target_crs": target_crs, "local": local, "level": level.value,
-        "cell": cell, "profile": profile, "prior": not no_prior, "seed": seed,
+        "cell": cell, "profile": profile, "seed": seed, "vertical": vertical.value, "out_crs": out_crs,
+        "prior": "none" if no_prior else prior.value, "prior_sigma": prior_sigma, "prior_yaw": prior_yaw,
+        "motion": motion.value,
         "recording": not no_recording, "force": force, "overwrite": overwrite,
     }  # fmt: skip
     if dump_pipeline:

@@ -58,6 +58,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         ground_cells=len(steps),
         ground_agreeing=int((np.abs(steps) < GROUND_AGREES_M).sum()),
         refined_away_m=_refined_away(pair, T),
+        final_agreeing=int((residual < tolerance).sum()),
     )
     shift = T[:3, 3]
     more = {
@@ -74,6 +75,25 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         ),
     }
     return evidence, more
+
+
+def agreement(pair: Pair, T: Floats, tolerance: float | None = None) -> tuple[int, int]:
+    """Count what agrees with a transform: ties in plan, and cells of common ground in height.
+
+    Args:
+        pair: with ties and rasters.
+        T: 4x4 from source to target work coordinates.
+        tolerance: plan distance within which a tie agrees, metres; one cell if None.
+
+    """
+    cell = pair.source.bev.grid.cell if pair.source.bev is not None else 1.0
+    ties = 0
+    if pair.ties is not None:
+        T_level = pair.target.T_level_work @ T @ geometry.inverse(pair.source.T_level_work)
+        gap = geometry.apply(T_level, pair.ties.source) - pair.ties.target
+        ties = int((np.hypot(gap[:, 0], gap[:, 1]) < (tolerance or max(cell, 1.0))).sum())
+    _, steps = overlap_of(geometry.apply(T, pair.source.sample), pair.target.sample).ground_steps()
+    return ties, int((np.abs(steps) < GROUND_AGREES_M).sum())
 
 
 def cross_validated(ties: Ties, tolerance: float, solved: dict[str, Any]) -> Floats:

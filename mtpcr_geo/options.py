@@ -22,8 +22,23 @@ class RegisterOptions(BaseModel):
     cell: float | None = Field(
         None, gt=0, allow_inf_nan=False, description="cell of the height rasters, metres; chosen if not given"
     )
-    prior: Literal[False] = Field(
-        False, description="use the clouds' shared georeference as a start; not offered yet"
+    vertical: Literal["refuse", "assume-same", "estimate"] = Field(
+        "refuse",
+        description="what to do with different or unknown vertical datums: refuse, take them as the same, or "
+        "estimate the offset",
+    )
+    out_crs: str | None = Field(None, description="CRS of the result, where it shall not be the target's")
+    prior: Literal["none", "georef"] = Field(
+        "none", description="georef starts from where both clouds' CRSs put them, and searches only near it"
+    )
+    prior_sigma: float = Field(
+        5.0, gt=0, allow_inf_nan=False, description="standard deviation of the source's place, metres"
+    )
+    prior_yaw: float = Field(
+        5.0, gt=0, le=180, allow_inf_nan=False, description="largest turn from the prior considered, degrees"
+    )
+    motion: Literal["rigid", "yaw", "translation"] = Field(
+        "rigid", description="degrees of freedom of the result: all six, yaw and shift, or the shift alone"
     )
     profile: Literal["default"] = Field("default", description="which set of steps and settings to run")
     seed: int = Field(0, ge=0, description="seed of everything random")

@@ -15,6 +15,8 @@ from mtpcr_geo.overlap import Overlap, overlap_of
 Floats = NDArray[np.float64]
 Method = Literal["gicp", "point_to_plane", "point_to_point", "none"]
 
+Motion = Literal["rigid", "yaw", "translation"]
+
 _SMALL_GICP_NAMES = {"gicp": "GICP", "point_to_plane": "PLANE_ICP", "point_to_point": "ICP"}
 FEWEST_POINTS = 200
 FIRST_REACH_M = 3.0
@@ -220,3 +222,21 @@ def settle_on_ground(
         "tilt_deg": float(np.degrees(geometry.rotation_angle(R))),
     }
     return Refinement(T, report)
+
+
+def constrain(T: Floats, motion: Motion, pivot: Floats, R_upright: Floats) -> Floats:
+    """Hold a transform to fewer degrees of freedom, keeping where it takes the overlap.
+
+    Args:
+        T: 4x4 from source to target, work coordinates.
+        motion: "rigid" keeps all six, "yaw" drops the tilt, "translation" drops the yaw too.
+        pivot: (3,) middle of the overlap, source coordinates: it goes where T takes it.
+        R_upright: (3, 3) rotation that both levellings make; what yaw is counted from.
+
+    """
+    if motion == "rigid":
+        return T
+    R = R_upright
+    if motion == "yaw":
+        R = geometry.yaw_matrix(geometry.yaw_of(T[:3, :3] @ R_upright.T)) @ R_upright
+    return geometry.compose(R, T[:3, :3] @ pivot + T[:3, 3] - R @ pivot)

@@ -87,13 +87,19 @@ def build_pipeline(
             "target_crs": options.target_crs,
             "source_crs": options.source_crs,
             "local": options.local,
+            "vertical": None if options.vertical == "refuse" else options.vertical,
+            "out_crs": options.out_crs,
             **seed,
         },
         {"type": "mtpcr.bev", "tag": "bev", "cell": options.cell},
-        {"type": "mtpcr.match", "tag": "match", **seed},
+        {"type": "mtpcr.match", "tag": "match", **_prior(options), **seed},
         {"type": "mtpcr.lift", "tag": "lift", **seed},
         {"type": "mtpcr.solve", "tag": "solve", **seed},
-        {"type": "mtpcr.refine", "tag": "refine"},
+        {
+            "type": "mtpcr.refine",
+            "tag": "refine",
+            "motion": None if options.motion == "rigid" else options.motion,
+        },
         {"type": "mtpcr.assess", "tag": "assess"},
         {"type": "mtpcr.write_bev", "tag": "rasters", "filename": where["bev"]},
         {"type": "mtpcr.write_ties", "tag": "ties", "filename": where["ties"]},
@@ -133,9 +139,15 @@ def registration_of(result: RunResult) -> Registration:
     pair = result.pair
     T = pair.T_file if pair is not None and pair.T_target_source is not None else None
     names = {path.name: name for name, path in OUTPUT_NAMES.items()}
-    names |= {"source.tif": "bev_source", "target.tif": "bev_target"}
+    names |= {f"{role}.tif": f"bev_{role}" for role in ("source", "target", "registered")}
     outputs = {names.get(path.name, path.stem): path for path in result.outputs}
     return Registration(verdict, T, pair, outputs, result.done)
+
+
+def _prior(options: RegisterOptions) -> dict[str, Any]:
+    if options.prior == "none":
+        return {}
+    return {"prior": options.prior, "prior_sigma": options.prior_sigma, "prior_yaw": options.prior_yaw}
 
 
 def _reader(path: str | Path, tag: str) -> dict[str, Any]:

@@ -93,6 +93,8 @@ class Matches:
         score: (n,) in 0..1.
         hypotheses: candidates in falling order of score; the first is the one the matches follow.
         report: what the matcher wants on record.
+        source_keypoints, target_keypoints: (k, 2) pixels of all keypoints, matched or not; None from
+            matchers that have none.
 
     """
 
@@ -101,6 +103,8 @@ class Matches:
     score: Floats
     hypotheses: tuple[Hypothesis, ...] = ()
     report: dict[str, Any] = field(default_factory=dict)
+    source_keypoints: Floats | None = None
+    target_keypoints: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -150,6 +154,7 @@ class Pair:
         matches, ties: what links them, once found.
         T_target_source: 4x4 in work coordinates (source work -> target work), once solved.
         solve_report, refine_report: how it came about, for the audit.
+        T_prior: 4x4 in work coordinates that was known beforehand, where a prior was asked for.
         verdict: the judgement, once made.
 
     """
@@ -162,6 +167,7 @@ class Pair:
     T_target_source: Floats | None = None
     solve_report: dict[str, Any] = field(default_factory=dict)
     refine_report: dict[str, Any] = field(default_factory=dict)
+    T_prior: Floats | None = None
     verdict: Verdict | None = None
 
     def with_(self, **changes: Any) -> Pair:
@@ -172,10 +178,14 @@ class Pair:
     def T_file(self) -> Floats:
         """4x4 on the coordinates as they stand in the files: source file -> target file.
 
+        Where a change of CRS makes the way no 4x4, this is the nearest one over the source.
+
         Raises:
             ValueError: if the pair is not solved yet.
 
         """
         if self.T_target_source is None:
             raise ValueError("the pair has no transform yet")
-        return self.target.link.T_file_work @ self.T_target_source @ self.source.link.T_work_file
+        from mtpcr_geo.crs import TransformChain
+
+        return TransformChain.of(self).T_file

@@ -21,7 +21,7 @@ from mtpcr_geo.errors import RegistrationError
 from mtpcr_geo.match.local import PatchMatches, match_patches
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.search import GlobalSearch, Layer, angle_between, distinct, score_nearby
-from mtpcr_geo.scene import Bev, Matches
+from mtpcr_geo.scene import Bev, Hypothesis, Matches
 from mtpcr_geo.solve import iterative_svd, ransac_upright
 
 Floats = NDArray[np.float64]
@@ -61,6 +61,27 @@ class CorrelationSettings:
     min_overlap_share: float = 0.03
     convincing_margin: float = 1.5
     convincing_surprise: float = 8.0
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known beforehand of the pose: the clouds' own georeference, say.
+
+    Attributes:
+        hypothesis: the pose as known.
+        radius_m: how far the source may lie from there.
+        yaw_range: how far it may be turned from there, radians.
+
+    """
+
+    hypothesis: Hypothesis
+    radius_m: float
+    yaw_range: float
+
+    def yaws(self, step: float) -> NDArray[np.float64]:
+        """Yaws to search, radians, at most ``step`` apart, the known one among them."""
+        count = 2 * max(1, int(np.ceil(self.yaw_range / step))) + 1
+        return self.hypothesis.yaw + np.linspace(-self.yaw_range, self.yaw_range, count)
 
 
 @dataclass(frozen=True)
@@ -110,6 +131,7 @@ def match(
     settings: CorrelationSettings,
     seed: int = 0,
     advance: Callable[[int], object] = lambda n: None,
+    prior: Prior | None = None,
 ) -> Matches:
     """Match two height rasters of unknown relative yaw and shift.
 
@@ -118,6 +140,7 @@ def match(
         settings: what governs the search.
         seed: of the sampling when patches vote.
         advance: called with 1 after each yaw searched.
+        prior: what is known of the pose; None to search everywhere.
 
     Returns:
         Local matches under the best hypothesis (possibly few), and all hypotheses, best first.
@@ -130,7 +153,7 @@ def match(
     pool: list[Candidate] = []
     searched = []
     for factor in search_factors(source, target):
-        found = _search(pyramid, factor, settings, advance)
+        found = _search(pyramid, factor, settings, advance, prior)
         searched.append({"cell_m": source.grid.cell * factor, "scores": [round(p.score, 3) for p in found]})
         pool = _distinct([*pool, *(_descend(pyramid, factor, pose) for pose in found)])
         pool = _distinct([_judge_by_patches(pyramid, c, settings, seed) for c in _worth_judging(pool)])
@@ -215,7 +238,11 @@ def margin_of(pool: Sequence[Candidate]) -> float:
 
 
 def _search(
-    pyramid: Pyramid, factor: int, settings: CorrelationSettings, advance: Callable[[int], object]
+    pyramid: Pyramid,
+    factor: int,
+    settings: CorrelationSettings,
+    advance: Callable[[int], object],
+    prior: Prior | None,
 ) -> list[Pose]:
     source, target = pyramid.at(factor)
     cell = source.grid.cell
@@ -224,6 +251,10 @@ def _search(
     steps = round(360.0 / settings.yaw_step_deg)
     yaws = np.arange(steps) * (2 * np.pi / steps)
     search = GlobalSearch(source, target, fewest)
+    if prior is not None:
+        known = pose_of(prior.hypothesis, centre_of(source.grid))
+        search.restrict(known.east, known.north, prior.radius_m)
+        yaws = prior.yaws(np.radians(settings.yaw_step_deg))
     poses = search.run(yaws, PEAKS_A_YAW, 4, advance)
     apart = distinct(poses, HYPOTHESES, np.radians(2 * settings.yaw_step_deg), 5 * cell)
     return [pose for i, pose in enumerate(apart) if i < 3 or pose.score >= HOPELESS_BELOW * apart[0].score]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -83,6 +84,22 @@ class GlobalSearch:
         height, width = target.grid.shape
         self._shape = tuple(scipy.fft.next_fast_len(n + side - 1, real=True) for n in (height, width))
         self._target_spectra = self._spectra(target.channels.stack)
+        self._allowed: NDArray[np.bool_] | None = None
+
+    def restrict(self, east: float, north: float, radius: float) -> None:
+        """Consider only poses that put the source raster's centre within ``radius`` metres of a place."""
+        rows, columns = (np.arange(n) for n in self._shape)
+        height, width = self.target.grid.shape
+        dy = np.where(rows < height, rows, rows - self._shape[0])
+        dx = np.where(columns < width, columns, columns - self._shape[1])
+        x, y = self._place(dx, dy)
+        reach = max(radius, self.target.grid.cell)
+        self._allowed = np.hypot(x[None, :] - east, y[:, None] - north) <= reach
+
+    def _place(self, dx: Any, dy: Any) -> tuple[Any, Any]:
+        """Where a shift of the turned raster by (dx, dy) cells puts its centre, metres."""
+        half, grid = self._turned_side / 2, self.target.grid
+        return grid.west + (dx + half) * grid.cell, grid.north - (dy + half) * grid.cell
 
     def _spectra(self, stack: Image) -> Spectrum:
         """Transform height, steps, mask and the squares of the first two: (5, ...)."""
@@ -107,7 +124,10 @@ class GlobalSearch:
             np.stack([m * M, a * A, e * E, aa * M, ee * M, m * AA, m * EE]), self._shape, workers=self.workers
         )
         score = correlation_score(overlap, (pa, pe), (sa, se), (ta, te))
-        return np.where(overlap >= self.min_overlap, score, -np.inf), overlap
+        considered = overlap >= self.min_overlap
+        if self._allowed is not None:
+            considered &= self._allowed
+        return np.where(considered, score, -np.inf), overlap
 
     def peaks(self, yaw: float, count: int, apart_cells: int) -> list[Pose]:
         """Find the best shifts under one yaw, at least ``apart_cells`` from each other."""
@@ -120,13 +140,12 @@ class GlobalSearch:
                 break
             dy = row if row < self.target.grid.height else row - rows
             dx = column if column < self.target.grid.width else column - columns
-            half = self._turned_side / 2
-            grid = self.target.grid
+            east, north = self._place(dx, dy)
             found.append(
                 Pose(
                     yaw,
-                    float(grid.west + (dx + half) * grid.cell),
-                    float(grid.north - (dy + half) * grid.cell),
+                    float(east),
+                    float(north),
                     float(score[row, column]),
                     round(float(overlap[row, column])),
                 )

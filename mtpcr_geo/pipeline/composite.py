@@ -11,11 +11,12 @@ from pydantic import Field
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 
 _HANDED_ON = {
-    "level": ("method", "target_crs", "source_crs", "local", "seed"),
+    "level": ("method", "target_crs", "source_crs", "local", "vertical", "out_crs", "seed"),
     "bev": ("cell",),
-    "match": ("seed",),
+    "match": ("prior", "prior_sigma", "prior_yaw", "seed"),
     "lift": ("seed",),
     "solve": ("seed",),
+    "refine": ("motion",),
 }
 METHOD = ("level", "bev", "match", "lift", "solve", "refine", "assess")
 
@@ -32,6 +33,20 @@ class RegisterStageOptions(StageOptions):
     target_crs: str | None = Field(None, description="CRS of the first cloud, instead of what it states")
     source_crs: str | None = Field(None, description="CRS of the second cloud, instead of what it states")
     local: bool = Field(False, description="both clouds are local, in metres, whatever they state")
+    vertical: Literal["refuse", "assume-same", "estimate"] = Field(
+        "refuse", description="what to do with different or unknown vertical datums"
+    )
+    out_crs: str | None = Field(
+        None, description="CRS of the result, where it shall not be the first cloud's"
+    )
+    prior: Literal["none", "georef"] = Field(
+        "none", description="georef starts from where both clouds' CRSs put them, and searches only near it"
+    )
+    prior_sigma: float = Field(5.0, gt=0, description="standard deviation of the source's place, metres")
+    prior_yaw: float = Field(5.0, gt=0, le=180, description="largest turn from the prior considered, degrees")
+    motion: Literal["rigid", "yaw", "translation"] = Field(
+        "rigid", description="degrees of freedom of the result: all six, yaw and shift, or the shift alone"
+    )
     seed: int = Field(0, ge=0, description="seed of everything random")
 
 

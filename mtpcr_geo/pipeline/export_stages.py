@@ -92,8 +92,8 @@ class WriteBev(EvidenceWriter):
         """Options of mtpcr.write_bev."""
 
         filename: Path = Field(
-            description="file to write; a # in it stands for 'source', 'target' and, once the pair is solved, "
-            "'registered': the source's raster laid over the target's"
+            description="file to write; a # in it stands for 'source', 'target' and, once the pair is "
+            "solved, 'registered': the source's raster laid over the target's"
         )
 
     def writes(self) -> list[Path]:

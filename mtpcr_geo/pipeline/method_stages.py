@@ -1,8 +1,9 @@
-"""The steps of the method as stages: thin, each calling its room."""
+"""The steps of the method as stages, from matching to the verdict: thin, each calling its room."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
@@ -10,188 +11,14 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mtpcr_geo import geometry
-from mtpcr_geo.cloud.base import Cloud
 from mtpcr_geo.errors import OptionError
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
-from mtpcr_geo.scene import Bev, Pair, Side
+from mtpcr_geo.scene import Bev, Pair
 
 if TYPE_CHECKING:
-    from mtpcr_geo.crs import FrameLink, WorkFrame
+    from mtpcr_geo.match.correlation import Prior
 
 Floats = NDArray[np.float64]
-
-
-class LevelOptions(StageOptions):
-    """Options of mtpcr.level."""
-
-    method: Literal["auto", "ransac", "none"] = Field(
-        "auto",
-        description="how to make clouds upright: auto trusts the vertical of a georeferenced cloud and "
-        "levels a local one by ground and vertical structure; ransac turns the ground plane horizontal; "
-        "none keeps them",
-    )
-    target_crs: str | None = Field(
-        None, description="CRS of the first cloud instead of what it states, or local"
-    )
-    source_crs: str | None = Field(
-        None, description="CRS of the second cloud instead of what it states, or local"
-    )
-    local: bool = Field(False, description="all clouds are local, in metres, whatever they state")
-    budget: int = Field(
-        4_000_000, ge=1000, description="points of each cloud to work on; rasters always use all points"
-    )
-    seed: int = Field(0, ge=0, description="seed of the random choices")
-
-
-class Level(Stage):
-    """Bring clouds into the work frame and make them upright.
-
-    Takes two clouds, the fixed one (target) first as in PDAL's filters.icp, or one cloud for a raster alone.
-    """
-
-    type: ClassVar[str] = "mtpcr.level"
-    Options: ClassVar[OptionsModel] = LevelOptions
-    options: LevelOptions
-
-    def check_inputs(self, inputs: Sequence[Value], context: RunContext) -> None:
-        """Settle the frames from the headers, so that a CRS that does not do is known before the run."""
-        from mtpcr_geo.cloud.las import check_distinct
-
-        clouds = [value for value in inputs if isinstance(value, Cloud)]
-        if len(clouds) in (1, 2) and all(cloud.count for cloud in clouds):
-            self._frames(clouds[0], clouds[-1])
-        if len(clouds) == 2:
-            check_distinct(*clouds)
-
-    def _frames(self, target: Cloud, source: Cloud) -> tuple[WorkFrame, FrameLink, FrameLink]:
-        from mtpcr_geo.crs import resolve_frames
-
-        return resolve_frames(
-            target,
-            source,
-            target_crs=self.options.target_crs,
-            source_crs=self.options.target_crs if source is target else self.options.source_crs,
-            local=self.options.local,
-        )
-
-    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
-        """Scan, sample and level each cloud."""
-        from mtpcr_geo.cloud.las import check_distinct
-        from mtpcr_geo.cloud.sample import scan
-        from mtpcr_geo.level import level
-
-        clouds = [value for value in inputs if isinstance(value, Cloud)]
-        if len(clouds) != len(inputs) or len(clouds) not in (1, 2):
-            raise OptionError(f"{self.label} takes two clouds, the fixed one first, or one; set its inputs")
-        target, source = clouds[0], clouds[-1]
-        if len(clouds) == 2:
-            check_distinct(target, source)
-        options = self.options
-        found = [
-            scan(cloud, budget=options.budget, seed=options.seed, progress=context.progress)
-            for cloud in clouds
-        ]
-        frame, *links = self._frames(target, source)
-        sides = []
-        for role, cloud, link, looked in zip(("target", "source"), clouds, links, found, strict=False):
-            sample = in_work_frame(link, looked.sample)
-            upright = level(sample, options.method, link.file_crs is not None, options.seed)
-            self.metadata[role] = {
-                "points": looked.count,
-                "noise_points": looked.dropped,
-                "sampled": len(looked.sample),
-                **upright.report,
-            }
-            sides.append(
-                Side(
-                    role,  # type: ignore[arg-type]
-                    cloud,
-                    link,
-                    sample,
-                    upright.T_level_work,
-                    {**upright.report, "complete": looked.complete},
-                )
-            )
-        return Pair(sides[0], sides[-1], frame)
-
-
-def in_work_frame(link: FrameLink, xyz: Floats) -> Floats:
-    """Take (n, 3) file coordinates to work coordinates, rounded to 10 micrometres.
-
-    Far from the origin a float64 coordinate carries nanometres of noise, and points that a LAS scale puts
-    exactly on the line between two cells would fall to either side by it.
-    """
-    return np.round(link.to_work(xyz), 5)
-
-
-class BevOptions(StageOptions):
-    """Options of mtpcr.bev."""
-
-    cell: float | None = Field(
-        None,
-        gt=0,
-        allow_inf_nan=False,
-        description="edge of a raster cell in metres; chosen from both clouds' densities if not given",
-    )
-
-
-class MakeBev(Stage):
-    """Rasterise highest z, lowest z and point count of each cloud (Eq. 2), streamed."""
-
-    type: ClassVar[str] = "mtpcr.bev"
-    Options: ClassVar[OptionsModel] = BevOptions
-    options: BevOptions
-
-    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
-        """Choose the cell and rasterise both sides."""
-        from mtpcr_geo.bev import choose_cell, density, grid_around, rasterise
-
-        pair = self.one_pair(inputs)
-        sides = [pair.target] if pair.source is pair.target else [pair.target, pair.source]
-        densities = [density(side.sample, side.cloud.count) for side in sides]
-        cell = self.options.cell or choose_cell(*densities)
-        self.metadata |= {"cell_m": cell, "cell_chosen": self.options.cell is None}
-        made = []
-        for side, dense in zip(sides, densities, strict=True):
-            levelled = side.levelled_sample
-            low, high = geometry.bounds(levelled)
-            whole = bool(side.level_report.get("complete", True))
-            if not whole:
-                # the sample may miss the outermost points
-                low, high = _levelled_bounds(side)
-            chunks = [levelled] if whole else _levelled_chunks(side, context)
-            bev = rasterise(chunks, grid_around(low, high, cell))
-            made.append(bev)
-            self.metadata[side.role] = {
-                "width": bev.grid.width,
-                "height": bev.grid.height,
-                "filled_share": float((bev.count > 0).mean()),
-                "points_per_m2": dense.per_m2,
-                "area_m2": dense.area_m2,
-            }
-        from dataclasses import replace
-
-        done = [replace(side, bev=bev) for side, bev in zip(sides, made, strict=True)]
-        return pair.with_(target=done[0], source=done[-1])
-
-
-def _levelled_chunks(side: Side, context: RunContext) -> Iterator[Floats]:
-    from mtpcr_geo.cloud.sample import surface_chunks
-
-    with context.progress.task(f"rasterising {side.cloud.name}", side.cloud.count) as advance:
-        for xyz in surface_chunks(side.cloud):
-            yield geometry.apply(side.T_level_work, in_work_frame(side.link, xyz))
-            advance(len(xyz))
-
-
-def _levelled_bounds(side: Side) -> tuple[Floats, Floats]:
-    """Bounds of the whole cloud once levelled, from the corners of its box: a little generous."""
-    low, high = side.cloud.minimum, side.cloud.maximum
-    corners = np.array(
-        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
-    )
-    placed = geometry.apply(side.T_level_work, side.link.to_work(corners))
-    return placed.min(axis=0), placed.max(axis=0)
 
 
 class MatchOptions(StageOptions):
@@ -202,6 +29,13 @@ class MatchOptions(StageOptions):
     patch: float = Field(24.0, gt=0, description="edge of a patch of the local matches, metres")
     reach: float = Field(6.0, gt=0, description="how far a patch may lie from the hypothesis, metres")
     min_overlap: float = Field(400.0, ge=0, description="smallest overlap considered, square metres")
+    prior: Literal["none", "georef"] = Field(
+        "none", description="georef starts from where both clouds' CRSs put them, and searches only near it"
+    )
+    prior_sigma: float = Field(
+        5.0, gt=0, description="standard deviation of the source's place under the prior, metres"
+    )
+    prior_yaw: float = Field(5.0, gt=0, le=180, description="largest turn from the prior considered, degrees")
     seed: int = Field(0, ge=0, description="seed of the random choices")
 
 
@@ -224,10 +58,40 @@ class Match(Stage):
             reach_m=self.options.reach,
             min_overlap_m2=self.options.min_overlap,
         )
-        with context.progress.task("searching all yaws", None) as advance:
-            matches = match(source, target, settings, self.options.seed, advance)
+        prior = self._prior(pair)
+        with context.progress.task("searching all yaws" if prior is None else "searching", None) as advance:
+            matches = match(source, target, settings, self.options.seed, advance, prior)
         self.metadata |= {"matches": len(matches.score), **matches.report}
-        return pair.with_(matches=matches)
+        known = None if prior is None else georeference(pair, self.label)
+        return pair.with_(matches=matches, T_prior=known)
+
+    def _prior(self, pair: Pair) -> Prior | None:
+        """Turn the shared georeference into a hypothesis between the levelled clouds."""
+        from mtpcr_geo.match.correlation import Prior
+        from mtpcr_geo.scene import Hypothesis
+
+        if self.options.prior == "none":
+            return None
+        T = georeference(pair, self.label)
+        T_level = pair.target.T_level_work @ T @ geometry.inverse(pair.source.T_level_work)
+        shift = (float(T_level[0, 3]), float(T_level[1, 3]))
+        known = Hypothesis(geometry.yaw_of(T_level[:3, :3]), shift, 0.0)
+        return Prior(known, 3.0 * self.options.prior_sigma, float(np.radians(self.options.prior_yaw)))
+
+
+def georeference(pair: Pair, label: str) -> Floats:
+    """Give the 4x4 from source to target work coordinates that both CRSs claim.
+
+    Raises:
+        OptionError: if a cloud has no CRS to claim it by.
+
+    """
+    if pair.frame.crs is None or pair.source.link.file_crs is None:
+        raise OptionError(
+            f"{label}: a prior from the georeference needs a CRS on both clouds; name it by --source-crs and "
+            "--target-crs, or search without a prior"
+        )
+    return geometry.translation(pair.source.link.origin - pair.target.link.origin)
 
 
 def _bevs(stage: Stage, pair: Pair) -> tuple[Bev, Bev]:
@@ -308,8 +172,6 @@ class Solve(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Solve in levelled coordinates, and compose both levelling rotations into the result."""
-        from dataclasses import replace
-
         from mtpcr_geo.solve import solve_ties
 
         pair = self.one_pair(inputs)
@@ -364,6 +226,9 @@ class RefineOptions(StageOptions):
         description="points of the source after thinning; the target may have three times as many",
     )
     iterations: int = Field(30, ge=1, description="iterations of each round at most")
+    motion: Literal["rigid", "yaw", "translation"] = Field(
+        "rigid", description="degrees of freedom of the result: all six, yaw and shift, or the shift alone"
+    )
     ground: bool = Field(True, description="settle height and tilt on the ground before, and height after")
 
 
@@ -376,7 +241,7 @@ class Refine(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Refine the solved transform."""
-        from mtpcr_geo.refine import icp, reaches_for, settle_on_ground
+        from mtpcr_geo.refine import constrain, icp, reaches_for, settle_on_ground
 
         pair = self.one_pair(inputs)
         if pair.T_target_source is None:
@@ -403,6 +268,11 @@ class Refine(Stage):
         if self.options.ground:
             settled = settle_on_ground(source, target, T, tilt=False)
             T, report["ground_after"] = settled.T, settled.report
+        if self.options.motion != "rigid" and pair.ties is not None:
+            T_work_level = geometry.inverse(pair.source.T_level_work)
+            pivot = geometry.apply(T_work_level, pair.ties.source.mean(axis=0, keepdims=True))[0]
+            upright = geometry.inverse(pair.target.T_level_work)[:3, :3] @ pair.source.T_level_work[:3, :3]
+            T = constrain(T, self.options.motion, pivot, upright)
         self.metadata |= report
         return pair.with_(T_target_source=T, refine_report={**report, "T_before": pair.T_target_source})
 
@@ -441,6 +311,7 @@ class Assess(Stage):
         if pair.T_target_source is None or pair.ties is None:
             raise OptionError(f"{self.label} needs a transform and ties; put mtpcr.solve before it")
         options = self.options
+        pair = self._no_worse_than_prior(pair)
         evidence, more = gather(pair, options.tolerance)
         limits = Limits(
             surprise=options.surprise,
@@ -451,3 +322,15 @@ class Assess(Stage):
         verdict = assess(evidence, limits, more)
         self.metadata |= {"verdict": verdict.name, "reasons": list(verdict.reasons), **verdict.metrics}
         return pair.with_(verdict=verdict)
+
+    def _no_worse_than_prior(self, pair: Pair) -> Pair:
+        """Keep the transform known beforehand where more ties and as much ground agree with it."""
+        from mtpcr_geo.evidence import agreement
+
+        if pair.T_prior is None or pair.T_target_source is None:
+            return pair
+        found = agreement(pair, pair.T_target_source, self.options.tolerance)
+        known = agreement(pair, pair.T_prior, self.options.tolerance)
+        better = known[0] >= found[0] and known[1] >= found[1]
+        self.metadata |= {"ties_and_ground_agreeing": found, "with_prior": known, "prior_kept": better}
+        return pair.with_(T_target_source=pair.T_prior) if better else pair
