@@ -32,7 +32,7 @@ from mtpcr_geo.evaluate import metrics
 
 FIELDS = (
     "pair", "start", "verdict", "success", "rotation_deg", "plan_m", "height_m", "time_s", "memory_mb",
-    "margin", "withheld_agreeing", "withheld", "sigma_plan_m", "reasons",
+    "margin", "withheld_agreeing", "withheld", "sigma_plan_m", "registered", "reasons",
 )  # fmt: skip
 
 
@@ -194,39 +194,37 @@ def line_of(row: dict[str, Any]) -> str:
 
 def summary(rows: list[dict[str, Any]], unrelated_runs: bool) -> str:
     """Sum up: by pair, and over all."""
-    lines = []
+    if not rows:
+        return "nothing to run"
     accepted = sum(row["verdict"] == "accepted" for row in rows)
-    times, memory = [row["time_s"] for row in rows], [row["memory_mb"] for row in rows]
-    if not unrelated_runs:
-        lines.append(
-            f"\n{'pair':32} {'accepted':>9} {'right':>7} {'rot deg med/max':>17} {'plan m med/max':>17} "
-            f"{'|z| m med/max':>15} {'s med/max':>12} {'MiB':>6}"
-        )
-        for name in dict.fromkeys(row["pair"] for row in rows):
-            own = [row for row in rows if row["pair"] == name]
-            cells = [
-                f"{np.median(v):.3f} / {np.max(v):.3f}" if v else "-"
-                for v in (
-                    [abs(row[key]) for row in own if row.get(key) is not None]
-                    for key in ("rotation_deg", "plan_m", "height_m")
-                )
-            ]
-            seconds = [row["time_s"] for row in own]
-            lines.append(
-                f"{name:32} {sum(r['verdict'] == 'accepted' for r in own):5} / {len(own):<2}"
-                f"{sum(bool(r.get('success')) for r in own):4} / {len(own):<2} {cells[0]:>15} {cells[1]:>17} {cells[2]:>15} "
-                f"{np.median(seconds):5.2f} / {max(seconds):5.2f} {max(r['memory_mb'] for r in own):5.0f}"
-            )
-    lines.append(
-        f"\n{len(rows)} runs: {accepted} accepted, {sum(bool(r.get('success')) for r in rows)} right within 5 degrees "
-        f"and 2 m; median {np.median(times):.2f} s, longest {max(times):.2f} s; peak memory {max(memory):.0f} MiB"
-    )
-    wrong = [r for r in rows if r["verdict"] == "accepted" and not r.get("success")]
+    seconds, memory = [row["time_s"] for row in rows], [row["memory_mb"] for row in rows]
+    told = [
+        f"\n{len(rows)} runs: {accepted} accepted; median {np.median(seconds):.2f} s, longest "
+        f"{max(seconds):.2f} s; peak memory {max(memory):.0f} MiB"
+    ]
     if unrelated_runs:
-        lines.append(f"registered.laz written in {sum(bool(r.get('registered')) for r in rows)} runs")
-    else:
-        lines.append(f"accepted but wrong: {len(wrong)}")
-    return "\n".join(lines)
+        told.append(f"registered.laz written in {sum(bool(row.get('registered')) for row in rows)} runs")
+        return "\n".join(told)
+    right = [bool(row.get("success")) for row in rows]
+    wrong = sum(row["verdict"] == "accepted" and not row.get("success") for row in rows)
+    told.append(f"right within 5 degrees and 2 m: {sum(right)}; accepted but wrong: {wrong}")
+    head = f"\n{'pair (median / worst)':28} {'accepted':>9} {'right':>7} {'rotation deg':>15} {'plan m':>15}"
+    lines = [head + f" {'height m':>15} {'s':>13} {'MiB':>6}"]
+    for name in [*dict.fromkeys(row["pair"] for row in rows), None]:
+        own = [row for row in rows if name in (None, row["pair"])]
+        lines.append(
+            f"{name or 'all':28} {sum(r['verdict'] == 'accepted' for r in own):4} / {len(own):<3}"
+            f" {sum(bool(r.get('success')) for r in own):3} / {len(own):<3}"
+            + "".join(f"{spread(own, key):>16}" for key in ("rotation_deg", "plan_m", "height_m"))
+            + f" {spread(own, 'time_s', 2):>13} {max(r['memory_mb'] for r in own):6.0f}"
+        )
+    return "\n".join([*lines, *told])
+
+
+def spread(rows: list[dict[str, Any]], key: str, digits: int = 3) -> str:
+    """Median and worst absolute value of a column."""
+    values = [abs(row[key]) for row in rows if row.get(key) is not None]
+    return f"{np.median(values):.{digits}f} / {max(values):.{digits}f}" if values else "-"
 
 
 if __name__ == "__main__":

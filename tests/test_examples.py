@@ -1,0 +1,54 @@
+"""Every example runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import REPOSITORY
+
+from mtpcr_geo import geometry
+
+
+def run(name: str, *arguments: object, seconds: int = 300) -> str:
+    env = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    command = [sys.executable, str(REPOSITORY / "examples" / name), *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=seconds, cwd=REPOSITORY, env=env)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture
+def pairs(town_files: tuple[Path, Path], tmp_path: Path) -> Path:
+    """Two folders of one pair each, in the form of the real ones."""
+    T = geometry.compose(geometry.yaw_matrix(np.deg2rad(-61.0)), np.array([14.0, -9.0, 2.5]))
+    from helpers_scene import ORIGIN
+
+    T = geometry.translation(ORIGIN) @ geometry.inverse(T) @ geometry.translation(-ORIGIN)
+    for name in ("a", "b"):
+        folder = tmp_path / "pairs" / name
+        folder.mkdir(parents=True)
+        for file in town_files:
+            shutil.copy(file, folder / file.name)
+        truth = {"T_target_from_source": T.tolist()}
+        (folder / "pair.json").write_text(json.dumps({"crs": "EPSG:25833", "ground_truth": truth}))
+    return tmp_path / "pairs"
+
+
+def test_benchmark_pairs(pairs: Path, tmp_path: Path) -> None:
+    told = run("benchmark_pairs.py", pairs, "--starts", 1, "--csv", tmp_path / "runs.csv")
+    assert "2 runs: 2 accepted" in told
+    assert "accepted but wrong: 0" in told
+    assert len((tmp_path / "runs.csv").read_text().splitlines()) == 3
+
+
+def test_simulate_pairs(tmp_path: Path) -> None:
+    told = run("simulate_pairs.py", tmp_path, "--first", 1)
+    assert "town_1" in told
+    assert (tmp_path / "town_1" / "pair.json").exists()
