@@ -1,0 +1,206 @@
+"""Keypoint matchers as matchers of rasters: turn the source through orientations, choose by consistency.
+
+No learned matcher survives more than about 45 degrees, so the source's image is turned through a sweep of
+orientations and matched in each. Matches of the right one agree on a yaw and a shift, with distances in
+metres; those of a wrong one do not. Cells may differ in size: both images are brought to metres first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo import geometry
+from mtpcr_geo.errors import RegistrationError
+from mtpcr_geo.match.base import Advance, Grey, ImageMatcher, PixelMatches, View, one_to_one
+from mtpcr_geo.match.search import angle_between
+from mtpcr_geo.raster import Grid
+from mtpcr_geo.scene import Hypothesis, Matches
+from mtpcr_geo.solve import ransac_upright
+
+Floats = NDArray[np.float64]
+
+TRIES = 20_000
+"""Pairs of matches tried for a yaw and a shift: finds a pose that 2 % of the matches support."""
+AGREE_CELLS = 1.5
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """What one orientation of the source came to.
+
+    Attributes:
+        turn: radians by which the source's image was turned, counter-clockwise.
+        found: one-to-one matches, in pixels of the unturned images.
+        T: 4x4 planar pose on which most of them agree, metres.
+        agreeing: (n,) those that agree.
+
+    """
+
+    turn: float
+    found: PixelMatches
+    T: Floats
+    agreeing: NDArray[np.bool_]
+
+    @property
+    def count(self) -> int:
+        """Number of matches that agree; two agree always, and count nothing."""
+        return max(int(self.agreeing.sum()) - 2, 0)
+
+
+@dataclass(frozen=True)
+class KeypointMatcher:
+    """A `Matcher` that looks at images, around any `ImageMatcher`.
+
+    Attributes:
+        name: what it is called in options and reports.
+        images: finds pairs of pixels.
+        turns: orientations tried, evenly round the circle, where the image matcher needs it.
+        tolerance_m: plan distance within which matches agree, metres; 1.5 of the larger cells if None.
+        empty: grey value of empty cells, by which turned images are extended.
+
+    """
+
+    name: str
+    images: ImageMatcher
+    turns: int = 8
+    tolerance_m: float | None = None
+    empty: int = 127
+    needs_image: bool = field(default=True, init=False)
+    needs_one_cell: bool = field(default=False, init=False)
+
+    def match(
+        self,
+        source: View,
+        target: View,
+        *,
+        seed: int = 0,
+        yaw: float | None = None,
+        advance: Advance = lambda n: None,
+    ) -> Matches:
+        """Match two views, see `Matcher.match`.
+
+        The matches handed on are all of the best orientation, agreeing or not: what is wrong is for the
+        solver to reject and for the verdict to count.
+        """
+        if source.image is None or target.image is None:
+            raise ValueError(f"{self.name} matches images, and a view has none")
+        prepared = self.images.prepare(target.image)
+        tolerance = self.tolerance_m or AGREE_CELLS * max(source.grid.cell, target.grid.cell)
+        tried = []
+        for turn in self._sweep(yaw):
+            found = self._match_turned(source.image, prepared, turn)
+            tried.append(_judge(turn, found, source.grid, target.grid, tolerance, seed))
+            advance(1)
+        best = max(tried, key=lambda o: (o.count, float(o.found.score.sum())))
+        if not len(best.found):
+            seen = max(len(o.found.source_keypoints) for o in tried), len(best.found.target_keypoints)
+            raise RegistrationError(
+                f"{self.name} finds no match between the images ({seen[0]} keypoints in the source's, "
+                f"{seen[1]} in the target's); they may be blank, too small, or of different places"
+            )
+        report: dict[str, Any] = {
+            "method": self.name,
+            "cell_m": [source.grid.cell, target.grid.cell],
+            "turns_deg": [round(float(np.degrees(o.turn)), 1) for o in tried],
+            "turn_matches": [len(o.found) for o in tried],
+            "turn_agreeing": [int(o.agreeing.sum()) for o in tried],
+            "turn_deg": float(np.degrees(best.turn)),
+            "agreeing": int(best.agreeing.sum()),
+            "tolerance_m": tolerance,
+            "keypoints": [len(best.found.source_keypoints), len(best.found.target_keypoints)],
+        }
+        return Matches(
+            best.found.source_px,
+            best.found.target_px,
+            best.found.score,
+            _hypotheses(tried),
+            report,
+            best.found.source_keypoints,
+            best.found.target_keypoints,
+        )
+
+    def _sweep(self, yaw: float | None) -> list[float]:
+        if self.images.any_yaw:
+            return [0.0]
+        if yaw is not None:
+            return [yaw]
+        return [2 * np.pi * k / self.turns for k in range(self.turns)]
+
+    def _match_turned(self, image: Grey, target: Any, turn: float) -> PixelMatches:
+        turned, back = turn_image(image, turn, self.empty)
+        found = self.images.match(self.images.prepare(turned), target)
+        return one_to_one(
+            PixelMatches(
+                _affine(back, found.source_px),
+                found.target_px,
+                np.clip(found.score, 0.0, 1.0),
+                _affine(back, found.source_keypoints),
+                found.target_keypoints,
+            )
+        )
+
+
+def turn_image(image: Grey, turn: float, fill: int) -> tuple[Grey, Floats]:
+    """Turn an image counter-clockwise (north up) onto a canvas that holds all of it.
+
+    Args:
+        image: (h, w) uint8.
+        turn: radians.
+        fill: grey value of what lies outside.
+
+    Returns:
+        The turned image, and the (2, 3) affine map from its pixels to those of the image given.
+
+    """
+    if turn == 0.0:
+        return image, np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    height, width = image.shape
+    c, s = np.cos(turn), np.sin(turn)
+    # rows run south, so that counter-clockwise seen from above turns (column, row) by minus the angle
+    R = np.array([[c, s], [-s, c]])
+    size = np.ceil(np.abs(R) @ [width, height]).astype(int)
+    middle, new_middle = np.array([width - 1, height - 1]) / 2, (size - 1) / 2
+    back = np.column_stack([R.T, middle - R.T @ new_middle])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    turned = cv2.warpAffine(
+        image,
+        back,
+        (int(size[0]), int(size[1])),
+        flags=flags,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=(float(fill),),
+    )
+    return np.asarray(turned, np.uint8), back
+
+
+def _affine(M: Floats, px: Floats) -> Floats:
+    return np.asarray(px @ M[:, :2].T + M[:, 2])
+
+
+def _judge(
+    turn: float, found: PixelMatches, source: Grid, target: Grid, tolerance: float, seed: int
+) -> Orientation:
+    s, t = source.to_metres(found.source_px), target.to_metres(found.target_px)
+    T, agreeing = ransac_upright(s, t, tolerance, seed, TRIES)
+    return Orientation(turn, found, T, agreeing)
+
+
+def _hypotheses(tried: list[Orientation]) -> tuple[Hypothesis, ...]:
+    """Give the poses of all orientations, those with most agreeing matches first; alike ones once."""
+    kept: list[Hypothesis] = []
+    for one in sorted(tried, key=lambda o: -o.count):
+        yaw = geometry.yaw_of(one.T[:3, :3])
+        shift = (float(one.T[0, 3]), float(one.T[1, 3]))
+        alike = any(
+            angle_between(yaw, other.yaw) < np.radians(5.0)
+            and np.hypot(shift[0] - other.shift[0], shift[1] - other.shift[1]) < 12.0
+            for other in kept
+        )
+        if one.count and not alike:
+            kept.append(Hypothesis(yaw, shift, float(one.count)))
+    return tuple(kept)
