@@ -1,0 +1,1 @@
+"""Other people's methods, run under the same protocol as ours."""

@@ -1,0 +1,41 @@
+"""FPFH and TEASER++, through its own Python binding where that is installed.
+
+H. Yang, J. Shi and L. Carlone (2020), doi:10.1109/TRO.2020.3033695.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mtpcr_geo import geometry
+from mtpcr_geo.evaluate.methods import Estimate
+from mtpcr_geo.evaluate.rivals.fpfh import FEWEST_MATCHES, Features, FpfhMethod, mutual_matches
+
+
+class FpfhTeaser(FpfhMethod):
+    """Mutual nearest neighbours of FPFH, and TEASER++ without scale."""
+
+    def solve(self, source: Features, target: Features) -> Estimate:
+        """Solve with a noise bound of one voxel, as its authors' example does."""
+        import teaserpp_python
+
+        matches = mutual_matches(source, target)
+        if len(matches) < FEWEST_MATCHES:
+            return Estimate(None, "refused", f"only {len(matches)} matches")
+        params = teaserpp_python.RobustRegistrationSolver.Params()
+        params.cbar2 = 1.0
+        params.noise_bound = self.voxel
+        params.estimate_scaling = False
+        params.rotation_estimation_algorithm = (
+            teaserpp_python.RobustRegistrationSolver.ROTATION_ESTIMATION_ALGORITHM.GNC_TLS
+        )
+        params.rotation_gnc_factor = 1.4
+        params.rotation_max_iterations = 100
+        params.rotation_cost_threshold = 1e-12
+        solver = teaserpp_python.RobustRegistrationSolver(params)
+        solver.solve(source.xyz[matches[:, 0]].T, target.xyz[matches[:, 1]].T)
+        solution = solver.getSolution()
+        if not solution.valid:
+            return Estimate(None, "refused", "its solver found nothing", {"matches": len(matches)})
+        T = geometry.compose(np.asarray(solution.rotation), np.asarray(solution.translation).ravel())
+        return Estimate(T, details={"matches": len(matches)})
