@@ -255,6 +255,48 @@ def apply(
 
 
 @app.command()
+def check(
+    source: Annotated[
+        Path, typer.Argument(help="Cloud that would move, or the only one.", show_default=False)
+    ],
+    target: Annotated[
+        Path | None, typer.Argument(help="Cloud that would stay; one cloud may do.", show_default=False)
+    ] = None,
+    source_crs: Annotated[
+        str | None, typer.Option(help="CRS of the source, instead of what its file states.")
+    ] = None,
+    target_crs: Annotated[
+        str | None, typer.Option(help="CRS of the target, instead of what its file states.")
+    ] = None,
+    local: Annotated[bool, typer.Option("--local", help="Both clouds are local, in metres.")] = False,
+    vertical: Annotated[
+        Vertical, typer.Option(help="What to do with different or unknown vertical datums.")
+    ] = Vertical.refuse,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Say what two clouds are and what is wrong with them, before they are registered.
+
+    Exit code 0: register would go on; else the code with which it would end.
+    """
+    from mtpcr_geo.check import check_clouds
+    from mtpcr_geo.check.show import show
+
+    with _progress(quiet) as progress:
+        report = check_clouds(
+            source,
+            target,
+            source_crs=source_crs,
+            target_crs=target_crs,
+            local=local,
+            vertical=vertical.value,
+            progress=progress,
+        )
+    show(report, as_json=as_json, quiet=quiet)
+    raise typer.Exit(report.exit_code)
+
+
+@app.command()
 def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the demo's files.")] = Path(
         "mtpcr-demo"

@@ -1,0 +1,6 @@
+"""A look at one or two clouds before they are registered: what they are, and what is wrong with them."""
+
+from mtpcr_geo.check.findings import Finding
+from mtpcr_geo.check.preflight import CheckReport, check_clouds
+
+__all__ = ["CheckReport", "Finding", "check_clouds"]

@@ -1,0 +1,248 @@
+"""Where the coordinates of a cloud lie by its CRS, and whether that can be."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo.check.findings import Finding, Role
+from mtpcr_geo.cloud.vlr import WKT_RECORD
+from mtpcr_geo.crs import CrsFacts, facts_of, parse_crs, same_place
+from mtpcr_geo.crs.facts import unbound
+from mtpcr_geo.crs.link import box_points
+from mtpcr_geo.crs.operation import area_of
+from mtpcr_geo.errors import CrsError
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+    from mtpcr_geo.cloud.las import LasCloud
+
+Floats = NDArray[np.float64]
+BEYOND_AREA_DEG = 0.5  # grids are used a little beyond their official area, and do not break there
+EXCHANGE = "exchange them, for example with PDAL's filters.ferry, or name the CRS that has them so"
+_COORDINATE_EPOCH = re.compile(r"COORDINATEMETADATA\b.*[,\s]EPOCH\s*\[\s*([0-9.]+)\s*\]", re.S | re.I)
+
+
+@dataclass(frozen=True)
+class Claim:
+    """The CRS in which a cloud's coordinates are taken to be.
+
+    Attributes:
+        facts: it, taken apart; None where nobody says one, or it cannot be handled.
+        by: who says so: "WKT", "GeoTIFF keys", "option" or "".
+
+    """
+
+    facts: CrsFacts | None
+    by: str
+
+
+def claim_of(cloud: LasCloud, said: str | None, local: bool) -> Claim:
+    """Find out what CRS a cloud is taken to be in, by its file or by what the user says."""
+    try:
+        if local:
+            return Claim(facts_of(None), "option")
+        if said is not None:
+            return Claim(facts_of(parse_crs(said)), "option")
+        if cloud.crs is None:
+            return Claim(None, "")
+        return Claim(facts_of(cloud.crs), _stated_by(cloud))
+    except CrsError:
+        return Claim(None, "")
+
+
+def _stated_by(cloud: LasCloud) -> str:
+    wkt = any(record.record_id == WKT_RECORD and record.states_crs for record in cloud.records)
+    return "WKT" if wkt else "GeoTIFF keys"
+
+
+def code_of(crs: CRS | None) -> str:
+    """Name a CRS by codes, such as "EPSG:25832+7837"; "" where it has none."""
+    if crs is None:
+        return ""
+    code = crs.to_authority()
+    if code is not None:
+        return ":".join(code)
+    parts = [unbound(part).to_authority() for part in unbound(crs).sub_crs_list]
+    if not parts or None in parts:
+        return ""
+    (first, number), *rest = [part for part in parts if part is not None]
+    return "+".join([f"{first}:{number}", *(n if a == first else f"{a}:{n}" for a, n in rest)])
+
+
+def epochs_of(cloud: LasCloud, facts: CrsFacts | None) -> tuple[float | None, float | None]:
+    """Find the epoch of the coordinates, and that at which a dynamic datum is defined, in years."""
+    epoch: float | None = None
+    for record in cloud.records:
+        if record.record_id == WKT_RECORD and record.states_crs:
+            found = _COORDINATE_EPOCH.search(record.data.decode("utf-8", errors="replace"))
+            epoch = float(found[1]) if found else epoch
+    frame: float | None = None
+    if facts is not None and facts.horizontal is not None:
+        base = unbound(facts.horizontal).geodetic_crs
+        datum: dict[str, Any] = (
+            base.datum.to_json_dict() if base is not None and base.datum is not None else {}
+        )
+        if "frame_reference_epoch" in datum:
+            frame = float(datum["frame_reference_epoch"])
+    return epoch, frame
+
+
+def claim_findings(
+    cloud: LasCloud, claim: Claim, said: str | None, local: bool, role: Role, one: bool
+) -> Iterator[Finding]:
+    """Say whether the CRS is known, by whom, and what it leaves open.
+
+    Args:
+        cloud: the file.
+        claim: the CRS it is taken to be in.
+        said: what the user says of it.
+        local: whether the user says that it is local.
+        role: which cloud it is.
+        one: whether it is the only one.
+
+    """
+    if said is None and not local and cloud.crs is None:
+        option = "--source-crs" if one else f"--{role}-crs"
+        yield Finding(
+            "error",
+            "crs-missing",
+            role,
+            f"no coordinate reference system is known ({cloud.crs_problem or 'the file states none'})"
+            f"{_guess(cloud)}",
+            f"give {option} EPSG:..., or {option} local if its coordinates are local metres",
+        )
+    elif cloud.crs_problem:
+        yield Finding("note", "crs-unreadable", role, f"{cloud.crs_problem}; what you say is taken instead")
+    elif cloud.crs is not None and claim.facts is not None and claim.by == "option":
+        named = claim.facts.crs
+        if named is None or not same_place(named, cloud.crs):
+            yield Finding(
+                "note",
+                "crs-overridden",
+                role,
+                f"the file states {cloud.crs.name}; {claim.facts.name} is taken instead, as you say",
+            )
+    epoch, frame = epochs_of(cloud, claim.facts)
+    if frame is not None and epoch is None:
+        yield Finding(
+            "note",
+            "epoch-missing",
+            role,
+            "its datum moves with time (defined at "
+            f"{frame:g}) and no epoch is stated: plates drift by centimetres a year",
+            "see that both clouds are of about the same epoch",
+        )
+    if claim.facts is not None and claim.facts.crs is not None and claim.facts.kind == "projected":
+        facts = claim.facts
+        if facts.height == "unsaid" and facts.height_unit != 1.0:
+            yield Finding(
+                "note",
+                "z-unit-unsaid",
+                role,
+                f"no unit of height is stated: its z is taken as {facts.height_unit_name}, like x and y",
+                "name a CRS with a vertical part if its heights are in metres, such as EPSG:2994+5703",
+            )
+
+
+def _guess(cloud: LasCloud) -> str:
+    low, high = cloud.minimum, cloud.maximum
+    if not np.isfinite(low + high).all():
+        return ""
+    if np.abs([low[0], high[0]]).max() <= 180 and np.abs([low[1], high[1]]).max() <= 90:
+        if np.ptp([low[:2], high[:2]], axis=0).max() < 1.0 < np.abs(low[:2]).max():
+            return "; its x and y look like degrees"
+        return "; its x and y look local"
+    if np.linalg.norm(low) > 6.2e6 and np.ptp([low, high], axis=0).max() < 1e5 and np.abs(low[2]) > 1e5:
+        return "; its coordinates look geocentric"
+    return "; its x and y look like a national grid or UTM"
+
+
+def area_findings(facts: CrsFacts, bounds: Floats, role: Role) -> Iterator[Finding]:
+    """Find coordinates beyond the area for which a CRS is made, among them exchanged axes.
+
+    Args:
+        facts: the CRS.
+        bounds: (2, 3) lowest and highest coordinates in it.
+        role: which cloud it is.
+
+    """
+    if facts.horizontal is None or facts.kind == "geocentric" or not np.isfinite(bounds).all():
+        return
+    if within_area(facts, bounds) is not False:
+        return
+    if within_area(facts, exchanged(bounds)):
+        yield Finding(
+            "warning",
+            "axes-swapped",
+            role,
+            f"x and y seem exchanged: as they stand they are outside the area of {facts.name}, "
+            "the other way round they are inside",
+            EXCHANGE,
+        )
+        return
+    degrees = (
+        facts.kind == "projected" and np.abs(bounds[:, 0]).max() <= 180 and np.abs(bounds[:, 1]).max() <= 90
+    )
+    hint = "; they look like degrees" if degrees else ""
+    yield Finding(
+        "warning",
+        "outside-area",
+        role,
+        f"coordinates about ({bounds[:, 0].mean():.6g}, {bounds[:, 1].mean():.6g}) are outside the area "
+        f"for which {facts.name} is made{hint}",
+        f"check that it is the right CRS; --{role}-crs names another" if role != "both" else "",
+    )
+
+
+def exchanged(bounds: Floats) -> Floats:
+    """Give bounds with x and y exchanged."""
+    return np.asarray(bounds)[:, [1, 0, 2]]
+
+
+def within_area(facts: CrsFacts, bounds: Floats) -> bool | None:
+    """Tell whether the middle of some bounds lies in a CRS's area of use; None where that is not known."""
+    if facts.crs is None or facts.horizontal is None:
+        return None
+    area = _area_of_use(facts)
+    if area is None:
+        return None
+    here = area_of(facts, box_points(bounds, 2))
+    if here is None:
+        return False
+    west, south, east, north = area
+    lon = (here.west_lon_degree + here.east_lon_degree) / 2
+    lat = (here.south_lat_degree + here.north_lat_degree) / 2
+    if east < west:
+        east += 360.0
+    inside_lon = any(
+        west - BEYOND_AREA_DEG <= lon + turn <= east + BEYOND_AREA_DEG for turn in (-360.0, 0.0, 360.0)
+    )
+    return bool(inside_lon and south - BEYOND_AREA_DEG <= lat <= north + BEYOND_AREA_DEG)
+
+
+def _area_of_use(facts: CrsFacts) -> tuple[float, float, float, float] | None:
+    """Find the area of a CRS; WKT1 states none, but mostly a code by which it can be looked up."""
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    if facts.crs is None or facts.horizontal is None:
+        return None
+    for crs in (unbound(facts.horizontal), unbound(facts.crs)):
+        if crs.area_of_use is not None:
+            return crs.area_of_use.bounds
+        code = crs.to_epsg()
+        if code is not None:
+            try:
+                area = CRS.from_epsg(code).area_of_use
+            except CRSError:
+                continue
+            if area is not None:
+                return area.bounds
+    return None

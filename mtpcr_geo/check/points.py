@@ -1,0 +1,206 @@
+"""What the points of one cloud say: where they truly lie, how densely, and what stands out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo.check.findings import Finding, Role, rewrite
+from mtpcr_geo.cloud.base import CHUNK_POINTS, Cloud, PointTable
+
+if TYPE_CHECKING:
+    from mtpcr_geo.cloud.las import LasCloud
+    from mtpcr_geo.cloud.sample import Scan
+
+Floats = NDArray[np.float64]
+
+SPARSE_PER_M2, VERY_SPARSE_PER_M2 = 0.5, 0.1
+FEW_POINTS = 10_000
+MUCH_NOISE, VERY_MUCH_NOISE = 0.05, 0.3
+TALLEST_M = 1500.0
+LOWEST_LAND_M, HIGHEST_LAND_M = -500.0, 9000.0
+
+
+class Watched(Cloud):
+    """A cloud that notes the bounds of all its points, noise too, while someone streams it."""
+
+    def __init__(self, cloud: Cloud) -> None:
+        self.cloud = cloud
+        self.name, self.crs, self.count = cloud.name, cloud.crs, cloud.count
+        self.minimum, self.maximum = cloud.minimum, cloud.maximum
+        self.seen_minimum, self.seen_maximum = np.full(3, np.inf), np.full(3, -np.inf)
+
+    def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
+        """Stream the coordinates."""
+        yield from self.cloud.xyz_chunks(size)
+
+    def table_chunks(self, size: int = CHUNK_POINTS) -> Iterator[PointTable]:
+        """Stream all dimensions."""
+        yield from self.cloud.table_chunks(size)
+
+    def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, NDArray[np.bool_]]]:
+        """Stream coordinates and what is noise, and note the bounds."""
+        for xyz, noise in self.cloud.noise_chunks(size):
+            np.fmin(self.seen_minimum, np.fmin.reduce(xyz, axis=0), out=self.seen_minimum)
+            np.fmax(self.seen_maximum, np.fmax.reduce(xyz, axis=0), out=self.seen_maximum)
+            yield xyz, noise
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A cloud in metres of its own frame.
+
+    Attributes:
+        sample: (n, 3) metres, near zero; without noise.
+        low, high: (3,) bounds of the whole cloud, likewise.
+        height: metres to add to the third column for the heights of the CRS.
+        per_m2: points per occupied square metre.
+        area_m2: area of the occupied cells.
+
+    """
+
+    sample: Floats
+    low: Floats
+    high: Floats
+    height: float
+    per_m2: float
+    area_m2: float
+
+    @property
+    def extent(self) -> Floats:
+        """(3,) metres from the lowest to the highest coordinate."""
+        return np.asarray(self.high - self.low)
+
+
+def bounds_findings(cloud: LasCloud, watched: Watched, role: Role) -> Iterator[Finding]:
+    """Hold the header's bounds against those of the points read."""
+    if not (np.isfinite(watched.seen_minimum).all() and np.isfinite(cloud.minimum + cloud.maximum).all()):
+        return
+    tolerance = np.maximum(2.0 * np.asarray(cloud.header.scales), 1e-9 * np.abs(watched.seen_maximum))
+    outside = np.maximum(cloud.minimum - watched.seen_minimum, watched.seen_maximum - cloud.maximum)
+    spare = np.maximum(watched.seen_minimum - cloud.minimum, cloud.maximum - watched.seen_maximum)
+    if (outside > tolerance).any():
+        axis = int((outside / tolerance).argmax())
+        yield Finding(
+            "warning",
+            "bounds-wrong",
+            role,
+            f"points lie up to {outside[axis]:.6g} units beyond the header's bounds in {'xyz'[axis]}: "
+            "programs that trust the header will miss them",
+            rewrite(cloud.path),
+        )
+    elif (spare > tolerance).any():
+        axis = int((spare / tolerance).argmax())
+        extent = float((watched.seen_maximum - watched.seen_minimum)[axis])
+        yield Finding(
+            "warning" if spare[axis] > max(extent, 1.0) else "note",
+            "bounds-wide",
+            role,
+            f"the header's bounds reach up to {spare[axis]:.6g} units beyond the points in {'xyz'[axis]}",
+            rewrite(cloud.path),
+        )
+
+
+def noise_findings(scan: Scan, role: Role) -> Iterator[Finding]:
+    """Say how much of the cloud is noise, where that is much."""
+    share = scan.dropped / max(scan.count, 1)
+    if share > MUCH_NOISE:
+        yield Finding(
+            "warning" if share > VERY_MUCH_NOISE else "note",
+            "noise",
+            role,
+            f"{share:.0%} of its points are classified as noise (7, 18) or withheld, and are left out",
+            "look at its classification, if they are not noise",
+        )
+
+
+def density_findings(measured: Measured, count: int, role: Role) -> Iterator[Finding]:
+    """Say whether there are enough points to see shapes by."""
+    if measured.per_m2 < SPARSE_PER_M2:
+        very = measured.per_m2 < VERY_SPARSE_PER_M2
+        yield Finding(
+            "warning" if very else "note",
+            "sparse",
+            role,
+            f"it has {measured.per_m2:.2g} points a square metre where it has any: cells will be coarse"
+            + (", and the result may be" if very else ""),
+            "give the cloud unthinned, if there is one",
+        )
+    if count < FEW_POINTS:
+        yield Finding(
+            "note",
+            "few-points",
+            role,
+            f"it has {count:,} points only",
+            "give the cloud unthinned or a larger part of it, if there is one",
+        )
+
+
+def height_findings(measured: Measured, unit_name: str, stated: bool, role: Role) -> Iterator[Finding]:
+    """Find heights that are no heights of a place: constant, stray, in other units, or off the earth.
+
+    Args:
+        measured: the cloud in metres.
+        unit_name: unit in which its heights are taken to be.
+        stated: whether a CRS says so, so that absolute heights mean something.
+        role: which cloud it is.
+
+    """
+    z = measured.sample[:, 2] + measured.height
+    low, middle, high = np.percentile(z, [0.1, 50.0, 99.9])
+    body = float(high - low)
+    lowest, highest = float(measured.low[2]) + measured.height, float(measured.high[2]) + measured.height
+    stray = max(highest - high, low - lowest)
+    if highest == lowest:
+        yield Finding(
+            "warning",
+            "z-constant",
+            role,
+            "all its points are at one height: there is nothing to match",
+            "check how it was exported",
+        )
+    elif stray > 5.0 * body + 20.0:
+        far = highest if highest - high >= low - lowest else lowest
+        yield Finding(
+            "warning",
+            "z-stray",
+            role,
+            f"a few points lie far from the rest in height, up to {far:.0f} m while nearly all are "
+            f"between {low:.0f} and {high:.0f} m",
+            "classify them as noise (7 or 18), or crop them",
+        )
+    elif highest - lowest > TALLEST_M or body > float(measured.extent[:2].max()):
+        yield Finding(
+            "warning",
+            "z-range",
+            role,
+            f"its heights span {highest - lowest:.0f} m over a plan of "
+            f"{measured.extent[0]:.0f} x {measured.extent[1]:.0f} m, taken in units of {unit_name}",
+            "check the unit of its heights (feet?) and its plan, and look for stray points",
+        )
+    if stated and not LOWEST_LAND_M <= middle <= HIGHEST_LAND_M:
+        yield Finding(
+            "warning",
+            "z-level",
+            role,
+            f"its heights lie about {middle:.0f} m, where there is no land; taken in units of {unit_name}",
+            "check the unit of its heights (feet? millimetres?) and its CRS",
+        )
+
+
+def plan_findings(measured: Measured, role: Role) -> Iterator[Finding]:
+    """Find the few points far away that make a raster huge."""
+    low, high = np.percentile(measured.sample[:, :2], [0.1, 99.9], axis=0)
+    stray = np.maximum(measured.high[:2] - high, low - measured.low[:2])
+    if (stray > 5.0 * (high - low) + 20.0).any():
+        yield Finding(
+            "warning",
+            "plan-stray",
+            role,
+            f"a few points lie up to {stray.max():,.0f} m away from the rest",
+            "crop them: readers.las and filters.crop in a pipeline do it",
+        )
