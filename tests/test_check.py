@@ -194,6 +194,11 @@ FILES = {
     "elsewhere": (
         lambda p: write(p, hills(1, place=(440_000.0, 100_000.0, 120.0))), "outside-area", "warning",
     ),
+    "in the next zone": (
+        lambda p: write(p, hills(1, place=(-800.0, 5_422_000.0, 120.0)), CRS.from_epsg(25833)),
+        "outside-area",
+        "note",
+    ),
     "degrees in a metric CRS": (
         lambda p: write(p, hills(1, place=(8.0, 49.0, 120.0), size=(0.01, 0.01)), scale=1e-7),
         "outside-area",

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from mtpcr_geo.cloud.las import LasCloud
 
 Floats = NDArray[np.float64]
-BEYOND_AREA_DEG = 0.5  # grids are used a little beyond their official area, and do not break there
+# grids are used a little beyond their area, and neighbouring zones for one another; they do not break there
+BEYOND_AREA_DEG, NEIGHBOUR_DEG = 0.5, 3.0
 EXCHANGE = "exchange them, for example with PDAL's filters.ferry, or name the CRS that has them so"
 _COORDINATE_EPOCH = re.compile(r"COORDINATEMETADATA\b.*[,\s]EPOCH\s*\[\s*([0-9.]+)\s*\]", re.S | re.I)
 
@@ -192,7 +193,7 @@ def area_findings(facts: CrsFacts, bounds: Floats, role: Role) -> Iterator[Findi
     )
     hint = "; they look like degrees" if degrees else ""
     yield Finding(
-        "warning",
+        "note" if within_area(facts, bounds, NEIGHBOUR_DEG) else "warning",
         "outside-area",
         role,
         f"coordinates about ({bounds[:, 0].mean():.6g}, {bounds[:, 1].mean():.6g}) are outside the area "
@@ -206,8 +207,18 @@ def exchanged(bounds: Floats) -> Floats:
     return np.asarray(bounds)[:, [1, 0, 2]]
 
 
-def within_area(facts: CrsFacts, bounds: Floats) -> bool | None:
-    """Tell whether the middle of some bounds lies in a CRS's area of use; None where that is not known."""
+def within_area(facts: CrsFacts, bounds: Floats, beyond: float = BEYOND_AREA_DEG) -> bool | None:
+    """Tell whether the middle of some bounds lies in a CRS's area of use, or little beyond.
+
+    Args:
+        facts: the CRS.
+        bounds: (2, 3) lowest and highest coordinates in it.
+        beyond: degrees around the area that still count.
+
+    Returns:
+        None where the area is not known.
+
+    """
     if facts.crs is None or facts.horizontal is None:
         return None
     area = _area_of_use(facts)
@@ -221,10 +232,8 @@ def within_area(facts: CrsFacts, bounds: Floats) -> bool | None:
     lat = (here.south_lat_degree + here.north_lat_degree) / 2
     if east < west:
         east += 360.0
-    inside_lon = any(
-        west - BEYOND_AREA_DEG <= lon + turn <= east + BEYOND_AREA_DEG for turn in (-360.0, 0.0, 360.0)
-    )
-    return bool(inside_lon and south - BEYOND_AREA_DEG <= lat <= north + BEYOND_AREA_DEG)
+    inside_lon = any(west - beyond <= lon + turn <= east + beyond for turn in (-360.0, 0.0, 360.0))
+    return bool(inside_lon and south - beyond <= lat <= north + beyond)
 
 
 def _area_of_use(facts: CrsFacts) -> tuple[float, float, float, float] | None:
