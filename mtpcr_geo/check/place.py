@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 # grids are used a little beyond their area, and neighbouring zones for one another; they do not break there
-BEYOND_AREA_DEG, NEIGHBOUR_DEG = 0.5, 3.0
+BEYOND_AREA_DEG, NEIGHBOUR_DEG = 0.5, 6.0
 EXCHANGE = "exchange them, for example with PDAL's filters.ferry, or name the CRS that has them so"
 _COORDINATE_EPOCH = re.compile(r"COORDINATEMETADATA\b.*[,\s]EPOCH\s*\[\s*([0-9.]+)\s*\]", re.S | re.I)
 
