@@ -139,7 +139,26 @@ def register(
     ] = 5.0,
     prior_yaw: Annotated[float, typer.Option(help="With --prior: largest turn considered, degrees.")] = 5.0,
     motion: Annotated[Motion, typer.Option(help="Degrees of freedom of the result.")] = Motion.rigid,
-    profile: Annotated[str, typer.Option(help="Which set of steps and settings to run.")] = "default",
+    profile: Annotated[
+        str, typer.Option(help="Which steps and settings to run: default, or paper (MT-PCR as published).")
+    ] = "default",
+    matcher: Annotated[
+        str | None,
+        typer.Option(help="Matcher: correlation, rootsift, orb, or a learned one (see: mtpcr-geo models)."),
+    ] = None,
+    models_folder: Annotated[
+        Path | None,
+        typer.Option("--models", help="Folder of model files, instead of $MTPCR_GEO_MODELS."),
+    ] = None,
+    no_res: Annotated[
+        bool, typer.Option("--no-res", help="Paper's profile: no resolution by density (Eq. 1).")
+    ] = False,
+    no_focus: Annotated[
+        bool, typer.Option("--no-focus", help="Paper's profile: do not match again where overlap is small.")
+    ] = False,
+    no_enhance: Annotated[
+        bool, typer.Option("--no-enhance", help="Paper's profile: do not sharpen the images (Eq. 4).")
+    ] = False,
     seed: Annotated[int, typer.Option(help="Seed of everything random.")] = 0,
     overwrite: Overwrite = False,
     force: Annotated[
@@ -163,7 +182,9 @@ def register(
 
     words = {
         "source_crs": source_crs, "target_crs": target_crs, "local": local, "level": level.value,
-        "cell": cell, "profile": profile, "seed": seed, "vertical": vertical.value, "out_crs": out_crs,
+        "cell": cell, "profile": profile, "matcher": matcher, "models": models_folder,
+        "res": not no_res, "focus": not no_focus, "enhance": not no_enhance,
+        "seed": seed, "vertical": vertical.value, "out_crs": out_crs,
         "prior": "none" if no_prior else prior.value, "prior_sigma": prior_sigma, "prior_yaw": prior_yaw,
         "motion": motion.value,
         "recording": not no_recording, "force": force, "overwrite": overwrite,
@@ -294,6 +315,20 @@ def check(
         )
     show(report, as_json=as_json, quiet=quiet)
     raise typer.Exit(report.exit_code)
+
+
+@app.command()
+def models(
+    folder: Annotated[
+        Path | None,
+        typer.Option("--models", help="Folder of model files, instead of $MTPCR_GEO_MODELS."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")] = False,
+) -> None:
+    """List the learned matchers: which files are there, their licences, and who publishes those missing."""
+    from mtpcr_geo.commands import print_models
+
+    print_models(folder, as_json=as_json)
 
 
 @app.command()

@@ -77,6 +77,27 @@ def print_schema() -> None:
     print(json.dumps(pipeline_schema(), indent=2))
 
 
+def print_models(folder: Path | None, *, as_json: bool) -> None:
+    """Print which learned matchers there are, and which of their files."""
+    from mtpcr_geo.match.model_files import VARIABLE, inventory, models_folder
+
+    where = models_folder(folder)
+    found = list(inventory(where))
+    if as_json:
+        print(_json({"folder": where, "models": found}))
+        return
+    print(f"models folder: {where}" if where else f"no models folder (give --models, or set {VARIABLE})")
+    for model in found:
+        print(f"\n{model['name']}: {model['title']}{'' if model['usable'] else ' - not usable yet'}")
+        for name, file in model["files"].items():
+            print(f"  {name}: " + (f"sha256 {file['sha256']}" if file else "missing"))
+        print(f"  licence: {model['licence']}")
+        if model["terms"]:
+            print(f"  terms: {model['terms']}")
+        print(f"  published by: {model['project']}")
+    print("\ncorrelation, rootsift and orb need no files and are always there")
+
+
 def print_outcome(result: RunResult | None, *, as_json: bool, verbose: bool, quiet: bool) -> None:
     """Print what a pipeline came to: its verdict if it has one, and its files."""
     if result is None:

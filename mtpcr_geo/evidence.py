@@ -32,7 +32,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
     """
     assert pair.T_target_source is not None
     assert pair.ties is not None
-    cell = pair.source.bev.grid.cell if pair.source.bev is not None else 1.0
+    cell = pair.cell
     tolerance = tolerance or max(cell, 1.0)
     T = pair.T_target_source
     ties = pair.ties
@@ -86,7 +86,7 @@ def agreement(pair: Pair, T: Floats, tolerance: float | None = None) -> tuple[in
         tolerance: plan distance within which a tie agrees, metres; one cell if None.
 
     """
-    cell = pair.source.bev.grid.cell if pair.source.bev is not None else 1.0
+    cell = pair.cell
     ties = 0
     if pair.ties is not None:
         T_level = pair.target.T_level_work @ T @ geometry.inverse(pair.source.T_level_work)

@@ -7,10 +7,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.paper import height_span
 from mtpcr_geo.scene import Bev, Matches, Ties
 
 Floats = NDArray[np.float64]
-Surface = Literal["ground", "top"]
+Surface = Literal["ground", "top", "grey"]
+Pixel = Literal["centre", "ceil"]
 
 GROUND_RADIUS_M = 4.0
 
@@ -21,6 +23,7 @@ def lift(
     target: Bev,
     *,
     surface: Surface = "ground",
+    pixel: Pixel = "centre",
     folds: int = 4,
     block_m: float = 40.0,
     seed: int = 0,
@@ -35,28 +38,35 @@ def lift(
         source: raster of the cloud that moves.
         target: raster of the cloud that stays.
         surface: "ground" takes the lowest z around the pixel, which both clouds see under canopy and
-            eaves; "top" takes the highest z of the cell, as in the paper.
+            eaves; "top" takes the highest z of the cell; "grey" has it in 255 steps, as in the paper.
+        pixel: "centre" puts a pixel at the centre of its cell; "ceil" at the north-east corner (Eq. 5).
         folds: parts into which the blocks are dealt; the first is withheld from the solve.
         block_m: edge of a block, metres.
         seed: chooses the blocks.
 
     """
-    s = lifted(matches.source_px, source, surface)
-    t = lifted(matches.target_px, target, surface)
+    s = lifted(matches.source_px, source, surface, pixel)
+    t = lifted(matches.target_px, target, surface, pixel)
     known = np.isfinite(s[:, 2]) & np.isfinite(t[:, 2])
     s, t, score = s[known], t[known], matches.score[known]
     fold = folds_of(t[:, :2], folds, block_m, seed)
     return Ties(s, t, score, fold, fold == 0, np.ones(len(s), bool))
 
 
-def lifted(pixel: Floats, bev: Bev, surface: Surface) -> Floats:
-    """Give (n, 3) metres of (n, 2) pixels: pixel centres, z from the float raster, NaN where empty."""
-    xy = bev.grid.to_metres(pixel)
-    column = np.round(pixel[:, 0]).astype(int)
-    row = np.round(pixel[:, 1]).astype(int)
+def lifted(px: Floats, bev: Bev, surface: Surface, pixel: Pixel = "centre") -> Floats:
+    """Give (n, 3) metres of (n, 2) pixels, see `lift`; z is NaN where the raster is empty."""
+    xy = bev.grid.to_metres(px)
+    if pixel == "ceil":
+        xy = xy + bev.grid.cell / 2
+    column = np.round(px[:, 0]).astype(int)
+    row = np.round(px[:, 1]).astype(int)
     inside = (column >= 0) & (column < bev.grid.width) & (row >= 0) & (row < bev.grid.height)
     column, row = np.where(inside, column, 0), np.where(inside, row, 0)
-    z = (bev.top if surface == "top" else _lowest_around(bev))[row, column]
+    z = (_lowest_around(bev) if surface == "ground" else bev.top)[row, column].astype(np.float64)
+    if surface == "grey":
+        low, high = height_span(bev)
+        step = max(high - low, 1e-6) / 255
+        z = low + step * np.floor((z - low) / step)
     return np.column_stack([xy, np.where(inside, z, np.nan)])
 
 

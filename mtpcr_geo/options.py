@@ -40,7 +40,20 @@ class RegisterOptions(BaseModel):
     motion: Literal["rigid", "yaw", "translation"] = Field(
         "rigid", description="degrees of freedom of the result: all six, yaw and shift, or the shift alone"
     )
-    profile: Literal["default"] = Field("default", description="which set of steps and settings to run")
+    profile: Literal["default", "paper"] = Field(
+        "default", description="which set of steps and settings to run: ours, or MT-PCR's as published"
+    )
+    matcher: str | None = Field(
+        None,
+        description="which matcher: correlation, rootsift, orb, or a learned one (see `mtpcr-geo models`); "
+        "correlation if not given, superpoint in the paper's profile",
+    )
+    models: Path | None = Field(
+        None, description="folder of model files; the environment variable MTPCR_GEO_MODELS if not given"
+    )
+    res: bool = Field(True, description="paper's profile: a resolution of its own for each cloud (Eq. 1)")
+    focus: bool = Field(True, description="paper's profile: match again where the overlap is small (FOCUS)")
+    enhance: bool = Field(True, description="paper's profile: sharpen the images (Eq. 4)")
     seed: int = Field(0, ge=0, description="seed of everything random")
     recording: bool = Field(True, description="keep a recording of the run for the rerun viewer")
     force: bool = Field(False, description="write the registered cloud though the verdict refuses it")

@@ -20,6 +20,9 @@ from mtpcr_geo.pipeline.runner import RunResult, Settings, execute
 from mtpcr_geo.pipeline.stage import Progress
 from mtpcr_geo.scene import Floats, Pair, Verdict
 
+MANY_TRIES = 20_000
+"""Pairs of ties tried for the robust start with keypoint matchers, of whose matches few may be right."""
+
 
 @dataclass(frozen=True)
 class Registration:
@@ -83,7 +86,7 @@ def build_pipeline(
             "type": "mtpcr.level",
             "tag": "level",
             "inputs": ["target", "source"],
-            "method": options.level,
+            "method": "ransac" if options.profile == "paper" and options.level == "auto" else options.level,
             "target_crs": options.target_crs,
             "source_crs": options.source_crs,
             "local": options.local,
@@ -91,16 +94,7 @@ def build_pipeline(
             "out_crs": options.out_crs,
             **seed,
         },
-        {"type": "mtpcr.bev", "tag": "bev", "cell": options.cell},
-        {"type": "mtpcr.match", "tag": "match", **_prior(options), **seed},
-        {"type": "mtpcr.lift", "tag": "lift", **seed},
-        {"type": "mtpcr.solve", "tag": "solve", **seed},
-        {
-            "type": "mtpcr.refine",
-            "tag": "refine",
-            "motion": None if options.motion == "rigid" else options.motion,
-        },
-        {"type": "mtpcr.assess", "tag": "assess"},
+        *(_paper_method(options, seed) if options.profile == "paper" else _method(options, seed)),
         {"type": "mtpcr.write_bev", "tag": "rasters", "filename": where["bev"]},
         {"type": "mtpcr.write_ties", "tag": "ties", "filename": where["ties"]},
         *(
@@ -118,6 +112,54 @@ def build_pipeline(
             before, {"type": "mtpcr.write_recording", "tag": "recording", "filename": where["recording"]}
         )
     return [_without_defaults(stage) for stage in stages]
+
+
+def _method(options: RegisterOptions, seed: dict[str, int]) -> list[dict[str, Any]]:
+    """Name the steps from raster to verdict."""
+    for name in ("res", "focus", "enhance"):
+        if not getattr(options, name):
+            raise OptionError(f"--no-{name} belongs to --profile paper")
+    correlation = options.matcher in (None, "correlation")
+    match = {"method": None if correlation else options.matcher, "models": _models(options)}
+    return [
+        {"type": "mtpcr.bev", "tag": "bev", "cell": options.cell},
+        {"type": "mtpcr.match", "tag": "match", **match, **_prior(options), **seed},
+        {"type": "mtpcr.lift", "tag": "lift", **seed},
+        {"type": "mtpcr.solve", "tag": "solve", "tries": None if correlation else MANY_TRIES, **seed},
+        {
+            "type": "mtpcr.refine",
+            "tag": "refine",
+            "motion": None if options.motion == "rigid" else options.motion,
+        },
+        {"type": "mtpcr.assess", "tag": "assess"},
+    ]
+
+
+def _paper_method(options: RegisterOptions, seed: dict[str, int]) -> list[dict[str, Any]]:
+    """Name the steps from raster to verdict as MT-PCR has them."""
+    if options.prior != "none" or options.motion != "rigid":
+        raise OptionError("--prior and --motion are not of the paper; leave them out, or --profile paper")
+    # without RES coordinates stay metres, and Eq. 2 makes pixels of one
+    res = {"cell": options.cell, "resolution": "eq1"} if options.res else {"cell": options.cell or 1.0}
+    matcher = options.matcher or "superpoint"
+    steps: list[dict[str, Any]] = [
+        {"type": "mtpcr.bev", "tag": "bev", **res, "pixel": "ceil"},
+        {"type": "mtpcr.enhance", "tag": "enhance", "look": "paper" if options.enhance else "grey"},
+        {"type": "mtpcr.match", "tag": "match", "method": matcher, "models": _models(options), **seed},
+    ]
+    if options.focus:
+        steps.append({"type": "mtpcr.focus", "tag": "focus", **seed})
+    return [
+        *steps,
+        {"type": "mtpcr.lift", "tag": "lift", "surface": "grey", "pixel": "ceil", **seed},
+        {"type": "mtpcr.solve", "tag": "solve", "upright": False, "robust_start": False, **seed},
+        {"type": "mtpcr.refine", "tag": "refine", "method": "point_to_point", "ground": False},
+        {"type": "mtpcr.assess", "tag": "assess"},
+    ]
+
+
+def _models(options: RegisterOptions) -> str | None:
+    return None if options.models is None else str(options.models)
 
 
 def read_options(options: dict[str, Any]) -> RegisterOptions:
@@ -156,4 +198,9 @@ def _reader(path: str | Path, tag: str) -> dict[str, Any]:
 
 
 def _without_defaults(stage: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in stage.items() if value is not None and value is not False}
+    flags = ("force", "local")
+    return {
+        key: value
+        for key, value in stage.items()
+        if value is not None and not (key in flags and value is False)
+    }

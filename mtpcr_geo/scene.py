@@ -14,6 +14,7 @@ from mtpcr_geo.raster import Grid
 
 if TYPE_CHECKING:
     from mtpcr_geo.crs import FrameLink, WorkFrame
+    from mtpcr_geo.enhance import Look
 
 Floats = NDArray[np.float64]
 VerdictName = Literal["accepted", "doubtful", "refused"]
@@ -38,6 +39,22 @@ class Bev:
 
 
 @dataclass(frozen=True)
+class Appearance:
+    """What keypoint matchers see of a raster.
+
+    Attributes:
+        look: how the image was made, see `mtpcr_geo.enhance.image_of`.
+        plain: (h, w) uint8 the grey image of heights (Eq. 3), before any enhancement.
+        image: (h, w) uint8 what is matched.
+
+    """
+
+    look: Look
+    plain: NDArray[np.uint8]
+    image: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
 class Side:
     """One of the two clouds on its way through the run.
 
@@ -49,6 +66,7 @@ class Side:
         T_level_work: 4x4 levelling rotation, from work to levelled coordinates (identity if upright).
         level_report: how it was levelled, for the audit.
         bev: its height raster, in levelled coordinates.
+        appearance: the image made of the raster, where one was asked for.
 
     """
 
@@ -59,6 +77,7 @@ class Side:
     T_level_work: Floats = field(default_factory=lambda: np.eye(4))
     level_report: dict[str, Any] = field(default_factory=dict)
     bev: Bev | None = None
+    appearance: Appearance | None = None
 
     @property
     def levelled_sample(self) -> Floats:
@@ -95,6 +114,8 @@ class Matches:
         report: what the matcher wants on record.
         source_keypoints, target_keypoints: (k, 2) pixels of all keypoints, matched or not; None from
             matchers that have none.
+        matcher: what found them, so that FOCUS can ask it again.
+        before_focus: the matches of the first pass, where FOCUS replaced them.
 
     """
 
@@ -105,6 +126,8 @@ class Matches:
     report: dict[str, Any] = field(default_factory=dict)
     source_keypoints: Floats | None = None
     target_keypoints: Floats | None = None
+    matcher: Any = None
+    before_focus: Matches | None = None
 
 
 @dataclass(frozen=True)
@@ -169,6 +192,12 @@ class Pair:
     refine_report: dict[str, Any] = field(default_factory=dict)
     T_prior: Floats | None = None
     verdict: Verdict | None = None
+
+    @property
+    def cell(self) -> float:
+        """The larger cell of both rasters, metres: how exact matches can be; 1 where there is none."""
+        cells = [side.bev.grid.cell for side in (self.source, self.target) if side.bev is not None]
+        return max(cells, default=1.0)
 
     def with_(self, **changes: Any) -> Pair:
         """Copy with some fields replaced."""

@@ -194,6 +194,7 @@ def solve_ties(
     tolerance: float,
     robust_start: bool = True,
     upright: bool = True,
+    tries: int = 2000,
     seed: int = 0,
 ) -> tuple[Solution, Mask]:
     """Solve the transform from the ties not withheld: robust start, then iterative SVD.
@@ -205,6 +206,7 @@ def solve_ties(
         tolerance: plan residual up to which a tie may agree with a pose, metres; about 1.5 cells.
         robust_start: begin from the yaw and shift that RANSAC finds; else from all ties, as in the paper.
         upright: solve yaw and shift, trusting the levelling; else all six degrees of freedom.
+        tries: pairs of ties that RANSAC tries.
         seed: of RANSAC.
 
     Returns:
@@ -225,7 +227,7 @@ def solve_ties(
     s, t = source[used], target[used]
     start = None
     if robust_start:
-        _, start = ransac_upright(s, t, tolerance, seed)
+        _, start = ransac_upright(s, t, tolerance, seed, tries)
         if start.sum() < least:
             raise RegistrationError(
                 f"of {len(used)} ties no {least} agree on one yaw and shift; the clouds may not overlap"

@@ -24,11 +24,13 @@ class View:
     Attributes:
         bev: its height raster, in levelled coordinates.
         image: (h, w) uint8 on the raster's grid; None for matchers that work on heights.
+        empty: grey value of empty cells, by which images are extended.
 
     """
 
     bev: Bev
     image: Grey | None = None
+    empty: int = 127
 
     @property
     def grid(self) -> Grid:
@@ -97,8 +99,14 @@ class ImageMatcher(Protocol):
     def any_yaw(self) -> bool:
         """Whether it finds its way at any angle; else the source is turned for it."""
 
-    def prepare(self, image: Grey) -> Any:
-        """Do what concerns one image alone; the target's is done once and used for every orientation."""
+    def prepare(self, image: Grey, empty: int) -> Any:
+        """Do what concerns one image alone; the target's is done once and used for every orientation.
+
+        Args:
+            image: (h, w) uint8.
+            empty: grey value by which it may be extended.
+
+        """
 
     def match(self, source: Any, target: Any) -> PixelMatches:
         """Match two prepared images."""

@@ -27,8 +27,8 @@ BLOCK = 2048
 class Extractor(Protocol):
     """Finds keypoints and describes them."""
 
-    def extract(self, image: Grey) -> Features:
-        """Find keypoints in a (h, w) uint8 image."""
+    def extract(self, image: Grey, empty: int = 0) -> Features:
+        """Find keypoints in a (h, w) uint8 image, extended by ``empty`` where need be."""
 
 
 class Pairing(Protocol):
@@ -53,7 +53,7 @@ class RootSift:
     max_keypoints: int = 8192
     contrast: float = 0.01
 
-    def extract(self, image: Grey) -> Features:
+    def extract(self, image: Grey, empty: int = 0) -> Features:
         """Find keypoints in a (h, w) uint8 image; descriptors are (n, 128), of unit length."""
         if min(image.shape) < 8:
             return _none(128)
@@ -78,7 +78,7 @@ class Orb:
     max_keypoints: int = 8192
     fast_threshold: int = 10
 
-    def extract(self, image: Grey) -> Features:
+    def extract(self, image: Grey, empty: int = 0) -> Features:
         """Find keypoints in a (h, w) uint8 image; descriptors are (n, 32) uint8, 256 bits."""
         if min(image.shape) < 8:
             return _none(32, np.uint8)
@@ -132,16 +132,18 @@ class FeatureMatcher:
     pairing: Pairing
     any_yaw: bool
 
-    def prepare(self, image: Grey) -> tuple[Features, tuple[int, int]]:
+    def prepare(self, image: Grey, empty: int) -> tuple[Features, tuple[int, int]]:
         """Extract the features of an image."""
-        return self.extractor.extract(image), (image.shape[0], image.shape[1])
+        return self.extractor.extract(image, empty), (image.shape[0], image.shape[1])
 
     def match(
         self, source: tuple[Features, tuple[int, int]], target: tuple[Features, tuple[int, int]]
     ) -> PixelMatches:
         """Pair the features of two images."""
         (s, shape_s), (t, shape_t) = source, target
-        index, score = self.pairing.pair(s, t, (shape_s, shape_t))
+        # as if both were padded to one size, so that places are scaled alike
+        shape = max(shape_s[0], shape_t[0]), max(shape_s[1], shape_t[1])
+        index, score = self.pairing.pair(s, t, (shape, shape))
         return PixelMatches(s.px[index[:, 0]], t.px[index[:, 1]], score, s.px, t.px)
 
 

@@ -27,6 +27,7 @@ Floats = NDArray[np.float64]
 TRIES = 20_000
 """Pairs of matches tried for a yaw and a shift: finds a pose that 2 % of the matches support."""
 AGREE_CELLS = 1.5
+LARGEST_MARGIN = 1000.0
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,8 @@ class Orientation:
         found: one-to-one matches, in pixels of the unturned images.
         T: 4x4 planar pose on which most of them agree, metres.
         agreeing: (n,) those that agree.
+        rival: 4x4 pose on which most of the others agree.
+        rival_count: how many they are, less two.
 
     """
 
@@ -45,6 +48,8 @@ class Orientation:
     found: PixelMatches
     T: Floats
     agreeing: NDArray[np.bool_]
+    rival: Floats
+    rival_count: int
 
     @property
     def count(self) -> int:
@@ -61,7 +66,6 @@ class KeypointMatcher:
         images: finds pairs of pixels.
         turns: orientations tried, evenly round the circle, where the image matcher needs it.
         tolerance_m: plan distance within which matches agree, metres; 1.5 of the larger cells if None.
-        empty: grey value of empty cells, by which turned images are extended.
 
     """
 
@@ -69,7 +73,6 @@ class KeypointMatcher:
     images: ImageMatcher
     turns: int = 8
     tolerance_m: float | None = None
-    empty: int = 127
     needs_image: bool = field(default=True, init=False)
     needs_one_cell: bool = field(default=False, init=False)
 
@@ -89,11 +92,11 @@ class KeypointMatcher:
         """
         if source.image is None or target.image is None:
             raise ValueError(f"{self.name} matches images, and a view has none")
-        prepared = self.images.prepare(target.image)
+        prepared = self.images.prepare(target.image, target.empty)
         tolerance = self.tolerance_m or AGREE_CELLS * max(source.grid.cell, target.grid.cell)
         tried = []
         for turn in self._sweep(yaw):
-            found = self._match_turned(source.image, prepared, turn)
+            found = self._match_turned(source.image, source.empty, prepared, turn)
             tried.append(_judge(turn, found, source.grid, target.grid, tolerance, seed))
             advance(1)
         best = max(tried, key=lambda o: (o.count, float(o.found.score.sum())))
@@ -103,6 +106,7 @@ class KeypointMatcher:
                 f"{self.name} finds no match between the images ({seen[0]} keypoints in the source's, "
                 f"{seen[1]} in the target's); they may be blank, too small, or of different places"
             )
+        hypotheses = _hypotheses(tried)
         report: dict[str, Any] = {
             "method": self.name,
             "cell_m": [source.grid.cell, target.grid.cell],
@@ -111,6 +115,7 @@ class KeypointMatcher:
             "turn_agreeing": [int(o.agreeing.sum()) for o in tried],
             "turn_deg": float(np.degrees(best.turn)),
             "agreeing": int(best.agreeing.sum()),
+            "margin": margin_of(hypotheses),
             "tolerance_m": tolerance,
             "keypoints": [len(best.found.source_keypoints), len(best.found.target_keypoints)],
         }
@@ -118,7 +123,7 @@ class KeypointMatcher:
             best.found.source_px,
             best.found.target_px,
             best.found.score,
-            _hypotheses(tried),
+            hypotheses,
             report,
             best.found.source_keypoints,
             best.found.target_keypoints,
@@ -131,9 +136,9 @@ class KeypointMatcher:
             return [yaw]
         return [2 * np.pi * k / self.turns for k in range(self.turns)]
 
-    def _match_turned(self, image: Grey, target: Any, turn: float) -> PixelMatches:
-        turned, back = turn_image(image, turn, self.empty)
-        found = self.images.match(self.images.prepare(turned), target)
+    def _match_turned(self, image: Grey, empty: int, target: Any, turn: float) -> PixelMatches:
+        turned, back = turn_image(image, turn, empty)
+        found = self.images.match(self.images.prepare(turned, empty), target)
         return one_to_one(
             PixelMatches(
                 _affine(back, found.source_px),
@@ -187,20 +192,33 @@ def _judge(
 ) -> Orientation:
     s, t = source.to_metres(found.source_px), target.to_metres(found.target_px)
     T, agreeing = ransac_upright(s, t, tolerance, seed, TRIES)
-    return Orientation(turn, found, T, agreeing)
+    left = ~agreeing
+    rival, also = ransac_upright(s[left], t[left], tolerance, seed, TRIES)
+    return Orientation(turn, found, T, agreeing, rival, max(int(also.sum()) - 2, 0))
 
 
 def _hypotheses(tried: list[Orientation]) -> tuple[Hypothesis, ...]:
-    """Give the poses of all orientations, those with most agreeing matches first; alike ones once."""
+    """Give all poses found, those with most agreeing matches first; alike ones once."""
+    poses = [(one.count, one.T) for one in tried] + [(one.rival_count, one.rival) for one in tried]
     kept: list[Hypothesis] = []
-    for one in sorted(tried, key=lambda o: -o.count):
-        yaw = geometry.yaw_of(one.T[:3, :3])
-        shift = (float(one.T[0, 3]), float(one.T[1, 3]))
+    for count, T in sorted(poses, key=lambda pose: -pose[0]):
+        yaw = geometry.yaw_of(T[:3, :3])
+        shift = (float(T[0, 3]), float(T[1, 3]))
         alike = any(
             angle_between(yaw, other.yaw) < np.radians(5.0)
             and np.hypot(shift[0] - other.shift[0], shift[1] - other.shift[1]) < 12.0
             for other in kept
         )
-        if one.count and not alike:
-            kept.append(Hypothesis(yaw, shift, float(one.count)))
+        if count and not alike:
+            kept.append(Hypothesis(yaw, shift, float(count)))
     return tuple(kept)
+
+
+def margin_of(hypotheses: tuple[Hypothesis, ...]) -> float:
+    """Give how many times more matches agree on the best pose than on the next, 1000 at most.
+
+    Repetitive scenes, such as rows of like houses, give several poses that many matches agree on.
+    """
+    if len(hypotheses) < 2:
+        return LARGEST_MARGIN if hypotheses else 1.0
+    return min(hypotheses[0].score / hypotheses[1].score, LARGEST_MARGIN)

@@ -81,29 +81,26 @@ class FusedLightGlue:
         path: its file.
         running: device and threads.
         any_yaw: whether it finds its way at any angle.
-        empty: grey value with which images are padded.
 
     """
 
-    def __init__(
-        self, model: FusedFile, path: Path, running: Running, *, any_yaw: bool = False, empty: int = 127
-    ) -> None:
+    def __init__(self, model: FusedFile, path: Path, running: Running, *, any_yaw: bool = False) -> None:
         self.model = model
         self.any_yaw = any_yaw
-        self.empty = empty
         self.graph = Graph(path, ("images",), ("keypoints", "matches", "mscores"), model.names, running)
 
-    def prepare(self, image: Grey) -> Grey:
+    def prepare(self, image: Grey, empty: int) -> tuple[Grey, int]:
         """Nothing can be done for one image alone."""
-        return image
+        return image, empty
 
-    def match(self, source: Grey, target: Grey) -> PixelMatches:
-        """Match two (h, w) uint8 images.
+    def match(self, first: tuple[Grey, int], second: tuple[Grey, int]) -> PixelMatches:
+        """Match two prepared images.
 
         Raises:
             InputError: if the graph gives something else than the contract says.
 
         """
+        (source, empty), (target, _) = first, second
         none = PixelMatches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
         if np.ptp(source) == 0 or np.ptp(target) == 0:
             return none
@@ -117,7 +114,7 @@ class FusedLightGlue:
         ]
         images = []
         for image in shrunk:
-            padded = np.full(shape, self.empty, np.uint8)
+            padded = np.full(shape, empty, np.uint8)
             padded[: image.shape[0], : image.shape[1]] = image
             images.append(as_input(padded, self.model.channels, self.model.mean, self.model.std))
         keypoints, matches, scores = self.graph.run(images=np.concatenate(images))

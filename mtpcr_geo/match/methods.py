@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from mtpcr_geo.enhance import Look, empty_grey
 from mtpcr_geo.errors import OptionError
 from mtpcr_geo.match.base import Advance, ImageMatcher, Matcher, View
-from mtpcr_geo.match.correlation import CorrelationSettings
+from mtpcr_geo.match.correlation import CorrelationSettings, Prior
 from mtpcr_geo.match.descriptors import Extractor, FeatureMatcher, NearestNeighbours, Orb, RootSift
 from mtpcr_geo.match.keypoints import KeypointMatcher
 from mtpcr_geo.match.model_files import ModelDescription, descriptions, models_folder, path_of
@@ -48,9 +47,16 @@ class KeypointSettings:
 
 @dataclass(frozen=True)
 class CorrelationMatcher:
-    """The default matcher as a `Matcher`."""
+    """The default matcher as a `Matcher`.
+
+    Attributes:
+        settings: what governs the search.
+        prior: a pose known beforehand.
+
+    """
 
     settings: CorrelationSettings
+    prior: Prior | None = None
     needs_image: bool = False
     needs_one_cell: bool = True
 
@@ -66,7 +72,7 @@ class CorrelationMatcher:
         """Search all yaws and all shifts, see `Matcher.match`; a known yaw is not made use of."""
         from mtpcr_geo.match.correlation import match
 
-        return match(source.bev, target.bev, self.settings, seed, advance)
+        return match(source.bev, target.bev, self.settings, seed, advance, self.prior)
 
 
 def names(folder: Path | None) -> list[str]:
@@ -74,15 +80,12 @@ def names(folder: Path | None) -> list[str]:
     return [*BUILT_IN, *descriptions(models_folder(folder))]
 
 
-def make_matcher(
-    name: str, correlation: CorrelationSettings, keypoints: KeypointSettings, look: Look = "band_pass"
-) -> Matcher:
+def make_matcher(name: str, correlation: CorrelationSettings, keypoints: KeypointSettings) -> Matcher:
     """Make a matcher.
 
     Args:
         name: what it is called.
         correlation, keypoints: settings of either kind.
-        look: of the images it will see.
 
     Raises:
         OptionError: if there is none of that name, or a description is wrong.
@@ -92,16 +95,10 @@ def make_matcher(
     """
     if name == "correlation":
         return CorrelationMatcher(correlation)
-    return KeypointMatcher(
-        name,
-        _images(name, keypoints, empty_grey(look)),
-        keypoints.turns,
-        keypoints.tolerance_m,
-        empty_grey(look),
-    )
+    return KeypointMatcher(name, _images(name, keypoints), keypoints.turns, keypoints.tolerance_m)
 
 
-def _images(name: str, settings: KeypointSettings, empty: int) -> ImageMatcher:
+def _images(name: str, settings: KeypointSettings) -> ImageMatcher:
     ratio = RATIO if settings.ratio is None else settings.ratio
     if name in ("rootsift", "orb"):
         most = settings.max_keypoints or 8192
@@ -114,12 +111,10 @@ def _images(name: str, settings: KeypointSettings, empty: int) -> ImageMatcher:
         from mtpcr_geo.pipeline.words import meant
 
         raise OptionError(f"there is no matcher {name!r}{meant(name, [*BUILT_IN, *known])}")
-    return _learned(known[name], folder, settings, empty)
+    return _learned(known[name], folder, settings)
 
 
-def _learned(
-    model: ModelDescription, folder: Path | None, settings: KeypointSettings, empty: int
-) -> ImageMatcher:
+def _learned(model: ModelDescription, folder: Path | None, settings: KeypointSettings) -> ImageMatcher:
     from mtpcr_geo.match.lightglue import FusedLightGlue, LightGlue
     from mtpcr_geo.match.onnx_models import OnnxExtractor, Running
 
@@ -127,7 +122,7 @@ def _learned(
     paths = {file: path_of(file, model, folder) for file in model.files}
     if model.fused is not None:
         path = paths[model.fused.file]
-        return FusedLightGlue(model.fused, path, running, any_yaw=model.any_yaw, empty=empty)
+        return FusedLightGlue(model.fused, path, running, any_yaw=model.any_yaw)
     assert model.extractor is not None  # the description was checked
     extractor = OnnxExtractor(
         model.extractor,
@@ -135,7 +130,6 @@ def _learned(
         running,
         tile=settings.tile,
         max_keypoints=settings.max_keypoints,
-        empty=empty,
     )
     if model.matcher is not None:
         return FeatureMatcher(

@@ -122,7 +122,6 @@ class OnnxExtractor:
         running: device and threads.
         tile: edge of the tiles, pixels; the description's if None.
         max_keypoints: kept of a whole image; the description's if None.
-        empty: grey value with which images are padded.
 
     """
 
@@ -134,20 +133,19 @@ class OnnxExtractor:
         *,
         tile: int | None = None,
         max_keypoints: int | None = None,
-        empty: int = 127,
     ) -> None:
         self.model = model
         self.max_keypoints = max_keypoints or model.max_keypoints
-        self.empty = empty
         self.tile = _multiple(max(tile or model.tile, 2 * OVERLAP_PX), model.size_multiple)
         self.graph = Graph(
             path, ("image", "max_keypoints"), ("keypoints", "scores", "descriptors"), model.names, running
         )
 
-    def extract(self, image: Grey) -> Features:
-        """Find keypoints in a (h, w) uint8 image; descriptors are float32 of unit length."""
+    def extract(self, image: Grey, empty: int = 0) -> Features:
+        """Find keypoints in a (h, w) uint8 image, padded by ``empty``; descriptors are float32."""
         parts = [
-            self._of_tile(image, column, row, core) for column, row, core in tiles(image.shape, self.tile)
+            self._of_tile(image, empty, column, row, core)
+            for column, row, core in tiles(image.shape, self.tile)
         ]
         px = np.concatenate([part.px for part in parts])
         score = np.concatenate([part.score for part in parts])
@@ -155,12 +153,14 @@ class OnnxExtractor:
         descriptors = np.concatenate([part.descriptors for part in parts])
         return Features(px[order], score[order], descriptors[order])
 
-    def _of_tile(self, image: Grey, column: int, row: int, core: tuple[int, int, int, int]) -> Features:
+    def _of_tile(
+        self, image: Grey, empty: int, column: int, row: int, core: tuple[int, int, int, int]
+    ) -> Features:
         part = image[row : row + self.tile, column : column + self.tile]
         height, width = part.shape
         padded = np.full(
             (_multiple(height, self.model.size_multiple), _multiple(width, self.model.size_multiple)),
-            self.empty,
+            empty,
             np.uint8,
         )
         padded[:height, :width] = part

@@ -17,6 +17,7 @@ from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptio
 from mtpcr_geo.scene import Pair, Side
 
 if TYPE_CHECKING:
+    from mtpcr_geo.bev import Density
     from mtpcr_geo.crs import FrameLink, WorkFrame
 
 Floats = NDArray[np.float64]
@@ -142,6 +143,22 @@ class BevOptions(StageOptions):
         allow_inf_nan=False,
         description="edge of a raster cell in metres; chosen from both clouds' densities if not given",
     )
+    resolution: Literal["common", "eq1", "eq1_occupied"] = Field(
+        "common",
+        description="one cell for both clouds, or a cell of its own for each by the paper's Eq. 1, from "
+        "points per area of the bounding box or of the occupied ground",
+    )
+    gamma: float | None = Field(
+        None,
+        gt=0,
+        allow_inf_nan=False,
+        description="the gamma of Eq. 1, metres; if not given, such that the geometric mean of both cells is "
+        "the cell given, or the one that would be chosen",
+    )
+    pixel: Literal["centre", "ceil"] = Field(
+        "centre",
+        description="which points a cell holds: our pixel centres, or the paper's ceiling (Eq. 2)",
+    )
 
 
 class MakeBev(Stage):
@@ -153,15 +170,16 @@ class MakeBev(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Choose the cell and rasterise both sides."""
-        from mtpcr_geo.bev import choose_cell, density, grid_around, rasterise
+        from mtpcr_geo.bev import Rasteriser, density, grid_around
+        from mtpcr_geo.paper import CeilRasteriser, ceil_grid
 
         pair = self.one_pair(inputs)
         sides = [pair.target] if pair.source is pair.target else [pair.target, pair.source]
         densities = [density(side.sample, side.cloud.count) for side in sides]
-        cell = self.options.cell or choose_cell(*densities)
-        self.metadata |= {"cell_m": cell, "cell_chosen": self.options.cell is None}
+        cells = self._cells(sides, densities)
+        self.metadata |= {"cell_m": cells[-1], "cell_chosen": self.options.cell is None}
         made = []
-        for side, dense in zip(sides, densities, strict=True):
+        for side, dense, cell in zip(sides, densities, cells, strict=True):
             levelled = side.levelled_sample
             low, high = geometry.bounds(levelled)
             whole = bool(side.level_report.get("complete", True))
@@ -169,9 +187,16 @@ class MakeBev(Stage):
                 # the sample may miss the outermost points
                 low, high = _levelled_bounds(side)
             chunks = [levelled] if whole else _levelled_chunks(side, context)
-            bev = rasterise(chunks, grid_around(low, high, cell))
+            if self.options.pixel == "ceil":
+                raster: Rasteriser = CeilRasteriser(ceil_grid(low, high, cell))
+            else:
+                raster = Rasteriser(grid_around(low, high, cell))
+            for chunk in chunks:
+                raster.add(chunk)
+            bev = raster.finish()
             made.append(bev)
             self.metadata[side.role] = {
+                "cell_m": cell,
                 "width": bev.grid.width,
                 "height": bev.grid.height,
                 "filled_share": float((bev.count > 0).mean()),
@@ -180,6 +205,26 @@ class MakeBev(Stage):
             }
         done = [replace(side, bev=bev) for side, bev in zip(sides, made, strict=True)]
         return pair.with_(target=done[0], source=done[-1])
+
+    def _cells(self, sides: list[Side], densities: list[Density]) -> list[float]:
+        """Choose the cell of each side: one for both, or by Eq. 1."""
+        from mtpcr_geo import paper
+        from mtpcr_geo.bev import choose_cell
+
+        usual = self.options.cell or choose_cell(*densities)
+        if self.options.resolution == "common":
+            return [usual] * len(sides)
+        areas = [dense.area_m2 for dense in densities]
+        if self.options.resolution == "eq1":
+            spans = [np.subtract(*geometry.bounds(side.levelled_sample)[::-1]) for side in sides]
+            areas = [float(span[0] * span[1]) for span in spans]
+        counts = [side.cloud.count for side in sides]
+        gamma = self.options.gamma or paper.usual_gamma(
+            tuple(n / area for n, area in zip(counts, areas, strict=True)), usual
+        )
+        self.metadata["gamma_m"] = gamma
+        res = [paper.resolution(n, area, gamma) for n, area in zip(counts, areas, strict=True)]
+        return [paper.cell_of(one) for one in res]
 
 
 def _levelled_chunks(side: Side, context: RunContext) -> Iterator[Floats]:

@@ -1,10 +1,10 @@
-"""The steps of the method as stages, from matching to the verdict: thin, each calling its room."""
+"""The steps of the method as stages, from lifting to the verdict: thin, each calling its room."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,68 +15,7 @@ from mtpcr_geo.errors import OptionError
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 from mtpcr_geo.scene import Bev, Pair
 
-if TYPE_CHECKING:
-    from mtpcr_geo.match.correlation import Prior
-
 Floats = NDArray[np.float64]
-
-
-class MatchOptions(StageOptions):
-    """Options of mtpcr.match."""
-
-    method: Literal["correlation"] = Field("correlation", description="which matcher")
-    yaw_step: float = Field(4.0, gt=0, le=30, description="step of the search over all yaws, degrees")
-    patch: float = Field(24.0, gt=0, description="edge of a patch of the local matches, metres")
-    reach: float = Field(6.0, gt=0, description="how far a patch may lie from the hypothesis, metres")
-    min_overlap: float = Field(400.0, ge=0, description="smallest overlap considered, square metres")
-    prior: Literal["none", "georef"] = Field(
-        "none", description="georef starts from where both clouds' CRSs put them, and searches only near it"
-    )
-    prior_sigma: float = Field(
-        5.0, gt=0, description="standard deviation of the source's place under the prior, metres"
-    )
-    prior_yaw: float = Field(5.0, gt=0, le=180, description="largest turn from the prior considered, degrees")
-    seed: int = Field(0, ge=0, description="seed of the random choices")
-
-
-class Match(Stage):
-    """Find point pairs in the two rasters, at any yaw."""
-
-    type: ClassVar[str] = "mtpcr.match"
-    Options: ClassVar[OptionsModel] = MatchOptions
-    options: MatchOptions
-
-    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
-        """Match the source's raster to the target's."""
-        from mtpcr_geo.match.correlation import CorrelationSettings, match
-
-        pair = self.one_pair(inputs)
-        source, target = _bevs(self, pair)
-        settings = CorrelationSettings(
-            yaw_step_deg=self.options.yaw_step,
-            patch_m=self.options.patch,
-            reach_m=self.options.reach,
-            min_overlap_m2=self.options.min_overlap,
-        )
-        prior = self._prior(pair)
-        with context.progress.task("searching all yaws" if prior is None else "searching", None) as advance:
-            matches = match(source, target, settings, self.options.seed, advance, prior)
-        self.metadata |= {"matches": len(matches.score), **matches.report}
-        known = None if prior is None else georeference(pair, self.label)
-        return pair.with_(matches=matches, T_prior=known)
-
-    def _prior(self, pair: Pair) -> Prior | None:
-        """Turn the shared georeference into a hypothesis between the levelled clouds."""
-        from mtpcr_geo.match.correlation import Prior
-        from mtpcr_geo.scene import Hypothesis
-
-        if self.options.prior == "none":
-            return None
-        T = georeference(pair, self.label)
-        T_level = pair.target.T_level_work @ T @ geometry.inverse(pair.source.T_level_work)
-        shift = (float(T_level[0, 3]), float(T_level[1, 3]))
-        known = Hypothesis(geometry.yaw_of(T_level[:3, :3]), shift, 0.0)
-        return Prior(known, 3.0 * self.options.prior_sigma, float(np.radians(self.options.prior_yaw)))
 
 
 def georeference(pair: Pair, label: str) -> Floats:
@@ -94,7 +33,13 @@ def georeference(pair: Pair, label: str) -> Floats:
     return geometry.translation(pair.source.link.origin - pair.target.link.origin)
 
 
-def _bevs(stage: Stage, pair: Pair) -> tuple[Bev, Bev]:
+def bevs_of(stage: Stage, pair: Pair) -> tuple[Bev, Bev]:
+    """Give both rasters, source first.
+
+    Raises:
+        OptionError: if the pair has none, or is one cloud.
+
+    """
     if pair.source is pair.target:
         raise OptionError(f"{stage.label} needs two clouds; give mtpcr.level a target and a source")
     if pair.source.bev is None or pair.target.bev is None:
@@ -105,9 +50,14 @@ def _bevs(stage: Stage, pair: Pair) -> tuple[Bev, Bev]:
 class LiftOptions(StageOptions):
     """Options of mtpcr.lift."""
 
-    surface: Literal["ground", "top"] = Field(
+    surface: Literal["ground", "top", "grey"] = Field(
         "ground",
-        description="height of a tie: the lowest z around it, or the highest z of its cell (the paper)",
+        description="height of a tie: the lowest z around it, the highest z of its cell, or that in 255 "
+        "steps (the paper's Eq. 5)",
+    )
+    pixel: Literal["centre", "ceil"] = Field(
+        "centre",
+        description="where in its cell a pixel lies: the centre, or the north-east corner (Eq. 5)",
     )
     folds: int = Field(
         4,
@@ -131,7 +81,7 @@ class Lift(Stage):
         from mtpcr_geo.lift import lift
 
         pair = self.one_pair(inputs)
-        source, target = _bevs(self, pair)
+        source, target = bevs_of(self, pair)
         if pair.matches is None:
             raise OptionError(f"{self.label} needs matches; put mtpcr.match before it")
         ties = lift(
@@ -139,6 +89,7 @@ class Lift(Stage):
             source,
             target,
             surface=self.options.surface,
+            pixel=self.options.pixel,
             folds=self.options.folds,
             block_m=self.options.block,
             seed=self.options.seed,
@@ -160,6 +111,9 @@ class SolveOptions(StageOptions):
         True,
         description="start from the yaw and shift most ties agree on (RANSAC); else from all (the paper)",
     )
+    tries: int = Field(
+        2000, ge=1, description="pairs of ties tried for the robust start; more where few of them are right"
+    )
     seed: int = Field(0, ge=0, description="seed of the robust start")
 
 
@@ -175,11 +129,11 @@ class Solve(Stage):
         from mtpcr_geo.solve import solve_ties
 
         pair = self.one_pair(inputs)
-        source, _ = _bevs(self, pair)
+        bevs_of(self, pair)
         if pair.ties is None:
             raise OptionError(f"{self.label} needs ties; put mtpcr.lift before it")
         ties = pair.ties
-        tolerance = self.options.tolerance or 1.5 * source.grid.cell
+        tolerance = self.options.tolerance or 1.5 * pair.cell
         solution, inlier = solve_ties(
             ties.source,
             ties.target,
@@ -188,6 +142,7 @@ class Solve(Stage):
             tolerance=tolerance,
             robust_start=self.options.robust_start,
             upright=self.options.upright,
+            tries=self.options.tries,
             seed=self.options.seed,
         )
         T_work_level = geometry.inverse(pair.target.T_level_work)
@@ -201,6 +156,7 @@ class Solve(Stage):
             "settings": {
                 "robust_start": self.options.robust_start,
                 "upright": self.options.upright,
+                "tries": self.options.tries,
                 "seed": self.options.seed,
             },
         }
@@ -252,8 +208,7 @@ class Refine(Stage):
             settled = settle_on_ground(source, target, T, tilt=True)
             T, report["ground_before"] = settled.T, settled.report
         if self.options.method != "none":
-            cell = pair.source.bev.grid.cell if pair.source.bev is not None else 1.0
-            reach = self.options.reach or reaches_for(cell)
+            reach = self.options.reach or reaches_for(pair.cell)
             refined = icp(
                 source,
                 target,

@@ -14,7 +14,7 @@ from mtpcr_geo.errors import OptionError
 from mtpcr_geo.pipeline.stage import Stage, StageOptions
 from mtpcr_geo.pipeline.words import meant
 
-_MODULES = ("io_stages", "frame_stages", "method_stages", "export_stages", "composite")
+_MODULES = ("io_stages", "frame_stages", "matcher_stages", "method_stages", "export_stages", "composite")
 
 
 @cache
