@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
+from math import exp, lgamma, log, log1p, pi
 
 MOST_DIGITS = 300.0
 
@@ -16,15 +16,24 @@ def surprise(agreeing: int, tried: int, chance: float) -> float:
         chance: probability that one agrees by chance, 0..1.
 
     """
-    from scipy.special import betainc
-
     if agreeing <= 0:
         return 0.0
-    # the tail of the binomial distribution is an incomplete beta function
-    tail = float(betainc(agreeing, tried - agreeing + 1, chance))
-    return MOST_DIGITS if tail <= 10.0**-MOST_DIGITS else max(-float(np.log10(tail)), 0.0)
+    if chance <= 0.0:
+        return MOST_DIGITS
+    # the binomial tail, summed in logarithms: its terms span hundreds of digits
+    terms = [
+        lgamma(tried + 1)
+        - lgamma(k + 1)
+        - lgamma(tried - k + 1)
+        + k * log(chance)
+        + (tried - k) * log1p(-chance)
+        for k in range(agreeing, tried + 1)
+    ]
+    largest = max(terms)
+    tail = largest + log(sum(exp(term - largest) for term in terms))
+    return min(max(-tail / log(10.0), 0.0), MOST_DIGITS)
 
 
 def chance_within(tolerance: float, reach: float) -> float:
     """Chance that a match anywhere in a square of half-width ``reach`` falls within a tolerance."""
-    return float(min(np.pi * tolerance**2 / (2 * reach) ** 2, 0.5))
+    return float(min(pi * tolerance**2 / (2 * reach) ** 2, 0.5))

@@ -8,11 +8,12 @@ a measure of how unlikely the agreement is by chance, comparable between small a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
 from mtpcr_geo.enhance import Channels
@@ -20,7 +21,6 @@ from mtpcr_geo.match.pose import Pose, centre_of, warp_to
 from mtpcr_geo.raster import Grid
 
 Image = NDArray[np.float32]
-Spectrum = NDArray[np.complex64]
 
 HEIGHT_FLOOR_M = 0.1
 STEP_FLOOR = 0.02
@@ -70,7 +70,7 @@ class GlobalSearch:
     Args:
         source, target: channels on grids of one cell size.
         min_overlap_cells: overlaps below this are not considered.
-        workers: threads of the transforms.
+        workers: threads among which the yaws are shared.
 
     """
 
@@ -82,7 +82,7 @@ class GlobalSearch:
         side = int(np.ceil(np.hypot(*source.grid.shape))) + 2
         self._turned_side = side
         height, width = target.grid.shape
-        self._shape = tuple(scipy.fft.next_fast_len(n + side - 1, real=True) for n in (height, width))
+        self._shape = tuple(cv2.getOptimalDFTSize(n + side - 1) for n in (height, width))
         self._target_spectra = self._spectra(target.channels.stack)
         self._allowed: NDArray[np.bool_] | None = None
 
@@ -101,10 +101,15 @@ class GlobalSearch:
         half, grid = self._turned_side / 2, self.target.grid
         return grid.west + (dx + half) * grid.cell, grid.north - (dy + half) * grid.cell
 
-    def _spectra(self, stack: Image) -> Spectrum:
-        """Transform height, steps, mask and the squares of the first two: (5, ...)."""
-        five = np.concatenate([stack, stack[:2] ** 2])
-        return np.asarray(scipy.fft.rfft2(five, self._shape, workers=self.workers))
+    def _spectra(self, stack: Image) -> list[Image]:
+        """Transform height, steps, mask and the squares of the first two; packed as OpenCV packs them."""
+        rows, columns = self._shape
+        spectra = []
+        for image in (*stack, stack[0] ** 2, stack[1] ** 2):
+            padded = np.zeros((rows, columns), np.float32)
+            padded[: image.shape[0], : image.shape[1]] = image
+            spectra.append(cv2.dft(padded, nonzeroRows=image.shape[0]))
+        return spectra
 
     def _turned(self, yaw: float) -> tuple[Image, Grid]:
         """Turn the source about its centre onto a square grid large enough for any yaw."""
@@ -118,10 +123,12 @@ class GlobalSearch:
     def scores(self, yaw: float) -> tuple[Image, Image]:
         """Score every shift under one yaw: scores and overlapping cells, both over cyclic shifts."""
         turned, _ = self._turned(yaw)
-        a, e, m, aa, ee = self._spectra(turned).conj()
+        a, e, m, aa, ee = self._spectra(turned)
         A, E, M, AA, EE = self._target_spectra
-        overlap, pa, pe, sa, se, ta, te = scipy.fft.irfft2(
-            np.stack([m * M, a * A, e * E, aa * M, ee * M, m * AA, m * EE]), self._shape, workers=self.workers
+        pairs = ((M, m), (A, a), (E, e), (M, aa), (M, ee), (AA, m), (EE, m))
+        overlap, pa, pe, sa, se, ta, te = (
+            cv2.idft(cv2.mulSpectrums(t, s, 0, conjB=True), flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)
+            for t, s in pairs
         )
         score = correlation_score(overlap, (pa, pe), (sa, se), (ta, te))
         considered = overlap >= self.min_overlap
@@ -160,9 +167,10 @@ class GlobalSearch:
     ) -> list[Pose]:
         """Search all yaws; best first. ``advance`` is called with 1 after each yaw."""
         poses: list[Pose] = []
-        for yaw in yaws:
-            poses += self.peaks(yaw, per_yaw, apart_cells)
-            advance(1)
+        with ThreadPoolExecutor(self.workers) as pool:
+            for found in pool.map(lambda yaw: self.peaks(yaw, per_yaw, apart_cells), yaws):
+                poses += found
+                advance(1)
         return sorted(poses, key=lambda pose: -pose.score)
 
 
