@@ -21,8 +21,10 @@ _SMALL_GICP_NAMES = {"gicp": "GICP", "point_to_plane": "PLANE_ICP", "point_to_po
 FEWEST_POINTS = 200
 FIRST_REACH_M = 3.0
 MOST_CUBES = 30_000_000
-STILL_RAD = 2e-5
-STILL_M = 5e-4
+STILL_RAD = 4e-6
+STILL_M = 1e-4
+LATTICE_M = 0.00037
+"""Shift of the thinning's cubes off whole millimetres, where points of a LAS scale lie in numbers."""
 FEWEST_GROUND_CELLS = 30
 CORRELATED_CELLS = 50
 GROUND_NOISE_M = 0.5
@@ -79,18 +81,20 @@ def icp(
 
     moved = geometry.apply(T_start, source)
     overlap = overlap_of(moved, target)
-    s, t = moved[overlap.select(moved)], target[overlap.select(target)]
+    of_source = np.flatnonzero(overlap.select(moved))
+    s, t = moved[of_source], target[overlap.select(target)]
     if min(len(s), len(t)) >= FEWEST_POINTS:
-        s, t = s[_near(s, t, reach_m[0])], t[_near(t, s, reach_m[0])]
+        near = _near(s, t, reach_m[0])
+        s, of_source, t = s[near], of_source[near], t[_near(t, s[near], reach_m[0])]
     if min(len(s), len(t)) < FEWEST_POINTS:
         raise RegistrationError(
             f"only {min(len(s), len(t))} points of one cloud lie in the overlap, too few to refine"
         )
     pivot = np.floor(t.mean(axis=0))
-    ps, pt = (
-        small_gicp.PointCloud(_at_most(small_gicp.voxelgrid_sampling(points - pivot, voxel_m, 1), most))
-        for points, most in ((s, most_points), (t, 3 * most_points))
-    )
+    # each cloud is thinned in its own frame, so that a hair's breadth at the start changes no point
+    s = geometry.apply(T_start, _thinned(source[of_source], voxel_m, most_points))
+    t = _thinned(t, voxel_m, 3 * most_points)
+    ps, pt = small_gicp.PointCloud(s - pivot), small_gicp.PointCloud(t - pivot)
     tree = small_gicp.KdTree(pt, threads)
     if method != "point_to_point":
         small_gicp.estimate_normals_covariances(ps, small_gicp.KdTree(ps, threads), neighbours, threads)
@@ -98,7 +102,7 @@ def icp(
     X, rounds = np.eye(4), []
     for reach in reach_m:
         # what a round leaves is taken up by the next; only the last must stand still
-        patience = 1.0 if reach == reach_m[-1] else 5.0
+        patience = 1.0 if reach == reach_m[-1] else 25.0
         result = small_gicp.align(
             pt,
             ps,
@@ -150,12 +154,25 @@ def _near(points: Floats, others: Floats, reach: float) -> NDArray[np.bool_]:
     return np.asarray(filled[tuple(np.floor((points - low) / edge).astype(np.int64).T)])
 
 
-def _at_most(cloud: Any, most: int) -> Floats:
-    """Give a cloud's (n, 3) points, evenly thinned in their order to a number at most."""
-    xyz = np.asarray(cloud.points())[:, :3]
-    if len(xyz) <= most:
-        return xyz
-    return xyz[np.linspace(0, len(xyz) - 1, most).astype(np.int64)]
+def _thinned(xyz: Floats, voxel: float, most: int) -> Floats:
+    """Give one mean point a cube of (n, 3) points, (m, 3), m at most a number.
+
+    Where cubes are too many, each is kept or left by a hash of its place: if a cube comes or goes, the
+    choice among all others stays.
+    """
+    import small_gicp
+
+    first = np.floor(geometry.bounds(xyz)[0] / voxel) - 1
+    corner = first * voxel + LATTICE_M
+    thin = np.asarray(small_gicp.voxelgrid_sampling(xyz - corner, voxel, 1).points())[:, :3]
+    if len(thin) > most:
+        cube = (np.floor(thin / voxel) + first).astype(np.int64).astype(np.uint64)
+        key = np.zeros(len(thin), np.uint64)
+        for axis in range(3):
+            key = (key ^ cube[:, axis]) * np.uint64(0x9E3779B97F4A7C15)
+            key ^= key >> np.uint64(29)
+        thin = thin[np.sort(np.argpartition(key, most)[:most])]
+    return thin + corner
 
 
 def reaches_for(cell: float) -> tuple[float, ...]:

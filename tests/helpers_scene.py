@@ -32,6 +32,31 @@ def town(rng: np.random.Generator, n: int, extent: float = 120.0) -> np.ndarray:
     return np.column_stack([xy, z + np.where(wall, roof * rng.uniform(size=n), roof)])
 
 
+def houses(rng: np.random.Generator, n: int, extent: float = 120.0, rough: float = 0.015) -> np.ndarray:
+    """(n, 3) points as a scanner sees such a town: roofs, ground and facades, rough by 1.5 cm."""
+    boxes = np.random.default_rng(42)
+    centre = boxes.uniform(-extent / 2, extent / 2, (25, 2))
+    half = boxes.uniform(3.0, 9.0, (25, 2))
+    height = boxes.uniform(3.0, 14.0, 25)
+
+    def ground(xy: np.ndarray) -> np.ndarray:
+        return 0.03 * xy[:, 0] + 0.5 * np.sin(xy[:, 1] / 15.0)
+
+    above = round(0.85 * n)
+    xy = rng.uniform(-extent / 2, extent / 2, (above, 2))
+    roof = np.zeros(above)
+    for c, h, top in zip(centre, half, height, strict=True):
+        inside = np.all(np.abs(xy - c) < h, axis=1)
+        roof[inside] = np.maximum(roof[inside], top)
+    house, side = rng.integers(0, 25, n - above), rng.integers(0, 4, n - above)
+    along, sign = rng.uniform(-1.0, 1.0, n - above), np.where(side % 2, 1.0, -1.0)
+    edge = np.where((side < 2)[:, None], np.column_stack([sign, along]), np.column_stack([along, sign]))
+    foot = centre[house] + edge * half[house]
+    wall = ground(foot) + rng.uniform(size=n - above) * height[house]
+    xyz = np.concatenate([np.column_stack([xy, ground(xy) + roof]), np.column_stack([foot, wall])])
+    return np.asarray(xyz + rng.normal(0.0, rough, xyz.shape))
+
+
 def rasterise(xyz: np.ndarray, cell: float = 1.0) -> Bev:
     """A plain BEV of (n, 3) points."""
     west, south = np.floor(xyz[:, :2].min(axis=0) / cell) * cell
