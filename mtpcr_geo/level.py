@@ -21,6 +21,7 @@ Mode = Literal["auto", "ransac", "none"]
 MAX_TILT_DEG = 25.0
 PLANE_TOLERANCE_M = 0.4
 NEIGHBOURS = 14
+THREADS = 2
 SHAPE_POINTS = 25_000
 FEWEST_VERTICALS = 60
 PLUMB_WITHIN_DEG = 20.0
@@ -160,13 +161,14 @@ def plumb_line(xyz: Floats, about: Floats, rng: np.random.Generator) -> PlumbLin
         rng: chooses the points whose neighbourhoods are looked at.
 
     """
-    from scipy.spatial import cKDTree
+    import small_gicp
 
     nothing = PlumbLine(None, 0, None)
     if len(xyz) < 10 * NEIGHBOURS:
         return nothing
     chosen = xyz if len(xyz) <= SHAPE_POINTS else xyz[rng.choice(len(xyz), SHAPE_POINTS, replace=False)]
-    _, index = cKDTree(xyz).query(chosen, NEIGHBOURS, workers=-1)
+    index, _ = small_gicp.KdTree(xyz, THREADS).batch_knn_search(chosen, NEIGHBOURS, THREADS)
+    index = index.astype(np.int64)
     hood = xyz[index] - xyz[index].mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", hood, hood))
     spread = np.sqrt(np.maximum(values, 0.0))
