@@ -1,4 +1,4 @@
-"""Peak memory of this process, measured anew for each run where the system allows it."""
+"""Memory of this process and of those it starts, measured anew for each run where the system allows."""
 
 from __future__ import annotations
 
@@ -34,3 +34,18 @@ def peak_mib() -> float | None:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 2**20 if sys.platform == "darwin" else peak / 1024
+
+
+def tree_mib(pid: int) -> float | None:
+    """Give the resident memory of a process and all that descend from it, now, in MiB.
+
+    None where the system does not tell (it is read from ``/proc``).
+    """
+    folder = Path("/proc") / str(pid)
+    try:
+        status = (folder / "status").read_text()
+        children = (folder / "task" / str(pid) / "children").read_text().split()
+    except OSError:
+        return None
+    own = next((int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS:")), 0)
+    return own / 1024 + sum(tree_mib(int(child)) or 0.0 for child in children)

@@ -101,7 +101,7 @@ def make_method(spec: str) -> Method:
         MissingPartError: if a library it needs is not installed.
 
     """
-    name, _, text = spec.partition(":")
+    name = spec.partition(":")[0]
     entry = METHODS.get(name)
     if entry is None:
         hint = meant(name, list(METHODS)) or f"; choose from {', '.join(METHODS)}"
@@ -112,7 +112,7 @@ def make_method(spec: str) -> Method:
                 f"the method {name} needs {library}, which is not installed: {entry.advice}"
             )
     factory: Callable[..., Method] = getattr(importlib.import_module(entry.module), entry.factory)
-    options = _options(text, spec)
+    options = options_of(spec)
     known = inspect.signature(factory).parameters
     if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values()):
         for key in options:
@@ -133,9 +133,15 @@ def load_libraries(spec: str) -> None:
             importlib.import_module(library)
 
 
-def _options(text: str, spec: str) -> dict[str, Any]:
+def options_of(spec: str) -> dict[str, Any]:
+    """Read the options in a method's text: numbers, yes and no, or words.
+
+    Raises:
+        OptionError: if one is not of the form ``option=value``.
+
+    """
     options: dict[str, Any] = {}
-    for part in filter(None, text.split(",")):
+    for part in filter(None, spec.partition(":")[2].split(",")):
         key, equals, value = part.partition("=")
         if not equals:
             raise OptionError(f"in the method {spec!r}, {part!r} is not of the form option=value")

@@ -19,7 +19,8 @@ A JSON file describes it::
 - The command writes the 4x4 that takes source to target as text to ``{result}``: the last sixteen numbers
   of the file count, row by row. Lines of words before them do no harm.
 - An exit code other than 0, no result within the time limit, or more memory than allowed: a run without an
-  answer, with the end of what the command printed as the reason.
+  answer, with the end of what the command printed as the reason. The memory limit is on the address space
+  of each process; the memory reported is that of the command and all it started, sampled 20 times a second.
 """
 
 from __future__ import annotations
@@ -27,23 +28,26 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
-import threading
+import time
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mtpcr_geo.errors import OptionError
+from mtpcr_geo.evaluate import memory
 from mtpcr_geo.evaluate.methods import Estimate
 from mtpcr_geo.pipeline.registry import first_problem
 
 Floats = NDArray[np.float64]
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_SAMPLE_S = 0.05
 # runs the command with a limit on its address space; a limit in the parent would bind the parent
 _LIMITER = (
     "import os, resource, sys; n = int(sys.argv[1]); resource.setrlimit(resource.RLIMIT_AS, (n, n)); "
@@ -187,28 +191,22 @@ def _filled(word: str, words: dict[str, str]) -> str:
 
 def _waited(process: subprocess.Popen[bytes], limit: float) -> tuple[int, float | None, bool]:
     """Wait for a process: its exit code, its peak memory in MiB, and whether it had to be stopped."""
-    if not hasattr(os, "wait4"):
+    end = time.monotonic() + limit
+    peak: float | None = None
+    while True:
         try:
-            return process.wait(limit), None, False
+            return process.wait(_SAMPLE_S), peak, False
         except subprocess.TimeoutExpired:
-            process.kill()
-            return process.wait(), None, True
-    stopped = threading.Event()
-
-    def stop() -> None:
-        stopped.set()
-        # its own session: what it has started goes with it
-        os.killpg(process.pid, 9)
-
-    timer = threading.Timer(limit, stop)
-    timer.start()
-    try:
-        _, status, usage = os.wait4(process.pid, 0)
-    finally:
-        timer.cancel()
-    process.returncode = os.waitstatus_to_exitcode(status)
-    scale: Any = 2**20 if sys.platform == "darwin" else 1024
-    return process.returncode, usage.ru_maxrss / scale, stopped.is_set()
+            # what the system adds up at the end would count this process too, as it was at the fork
+            now = memory.tree_mib(process.pid)
+            peak = now if peak is None else max(peak, now or 0.0)
+        if time.monotonic() > end:
+            if os.name == "posix":
+                # its own session: what it has started goes with it
+                os.killpg(process.pid, signal.SIGKILL)
+            else:
+                process.kill()
+            return process.wait(), peak, True
 
 
 def _end_of(told: Path) -> str:
