@@ -161,8 +161,14 @@ def density(xyz: Floats, count: int) -> Density:
     return Density(area, count / area)
 
 
-def choose_cell(*densities: Density) -> float:
-    """Choose one cell size for both rasters, metres: set by the sparser cloud, in steps of half a metre."""
+def choose_cell(*densities: Density, finest: float = FINEST_AUTO_CELL_M) -> float:
+    """Choose one cell size for both rasters, metres: set by the sparser cloud, in steps of half a metre.
+
+    Args:
+        densities: of the clouds.
+        finest: no finer than this, metres.
+
+    """
     sparsest = min(d.per_m2 for d in densities)
     wanted = np.sqrt(POINTS_PER_CELL / sparsest)
-    return float(np.clip(np.round(wanted * 2) / 2, FINEST_AUTO_CELL_M, COARSEST_AUTO_CELL_M))
+    return float(np.clip(np.round(wanted * 2) / 2, finest, COARSEST_AUTO_CELL_M))

@@ -15,6 +15,7 @@ from mtpcr_geo.scene import Floats, Pair, Ties
 from mtpcr_geo.solve import solve_ties
 
 GROUND_AGREES_M = 0.5
+UNBOUNDED_CELLS = 2.0
 TIES_A_PATCH = 4
 """Patches overlap by half, so about four ties tell what one independent tie would."""
 
@@ -24,7 +25,8 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
 
     Args:
         pair: solved, with rasters and ties.
-        tolerance: plan distance within which a withheld tie agrees, metres; one cell if None.
+        tolerance: plan distance within which a withheld tie agrees, metres; if None, one cell, or two where
+            the matcher does not bound its matches: keypoints are coarser, and chance agreement rarer.
 
     Returns:
         The evidence, and further metrics: pose, uncertainty and tie residuals.
@@ -33,14 +35,14 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
     assert pair.T_target_source is not None
     assert pair.ties is not None
     cell = pair.cell
-    tolerance = tolerance or max(cell, 1.0)
+    matched = pair.matches.report if pair.matches is not None else {}
+    tolerance = tolerance or max(cell, 1.0) * (1.0 if "reach_m" in matched else UNBOUNDED_CELLS)
     T = pair.T_target_source
     ties = pair.ties
     T_level = pair.target.T_level_work @ T @ geometry.inverse(pair.source.T_level_work)
     residual = np.hypot(*(geometry.apply(T_level, ties.source) - ties.target)[:, :2].T)
     withheld = cross_validated(ties, tolerance, pair.solve_report)
     agreeing = withheld < tolerance
-    matched = pair.matches.report if pair.matches is not None else {}
     moved = geometry.apply(T, pair.source.sample)
     overlap = overlap_of(moved, pair.target.sample)
     _, steps = overlap.ground_steps()

@@ -120,9 +120,11 @@ def _method(options: RegisterOptions, seed: dict[str, int]) -> list[dict[str, An
         if not getattr(options, name):
             raise OptionError(f"--no-{name} belongs to --profile paper")
     correlation = options.matcher in (None, "correlation")
-    match = {"method": None if correlation else options.matcher, "models": _models(options)}
+    match = {} if correlation else {"method": options.matcher, "models": _models(options)}
+    # learned keypoints like fine detail, where the points are dense enough to show it
+    finest = None if correlation or options.matcher in ("rootsift", "orb") else 0.5
     return [
-        {"type": "mtpcr.bev", "tag": "bev", "cell": options.cell},
+        {"type": "mtpcr.bev", "tag": "bev", "cell": options.cell, "finest": finest},
         {"type": "mtpcr.match", "tag": "match", **match, **_prior(options), **seed},
         {"type": "mtpcr.lift", "tag": "lift", **seed},
         {"type": "mtpcr.solve", "tag": "solve", "tries": None if correlation else MANY_TRIES, **seed},

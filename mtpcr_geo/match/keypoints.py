@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 TRIES = 20_000
 """Pairs of matches tried for a yaw and a shift: finds a pose that 2 % of the matches support."""
 AGREE_CELLS = 1.5
-LARGEST_MARGIN = 1000.0
+MOST_ZOOM = 2.0
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,7 @@ class KeypointMatcher:
         name: what it is called in options and reports.
         images: finds pairs of pixels.
         turns: orientations tried, evenly round the circle, where the image matcher needs it.
+        magnify_to: edge in pixels to which smaller images are magnified, at most twice; 0 for never.
         tolerance_m: plan distance within which matches agree, metres; 1.5 of the larger cells if None.
 
     """
@@ -73,6 +74,7 @@ class KeypointMatcher:
     images: ImageMatcher
     turns: int = 8
     tolerance_m: float | None = None
+    magnify_to: int = 0
     needs_image: bool = field(default=True, init=False)
     needs_one_cell: bool = field(default=False, init=False)
 
@@ -92,11 +94,13 @@ class KeypointMatcher:
         """
         if source.image is None or target.image is None:
             raise ValueError(f"{self.name} matches images, and a view has none")
-        prepared = self.images.prepare(target.image, target.empty)
+        longest = max(*source.image.shape, *target.image.shape)
+        zoom = float(np.clip(self.magnify_to / longest, 1.0, MOST_ZOOM))
+        prepared = self.images.prepare(magnified(target.image, zoom), target.empty)
         tolerance = self.tolerance_m or AGREE_CELLS * max(source.grid.cell, target.grid.cell)
         tried = []
         for turn in self._sweep(yaw):
-            found = self._match_turned(source.image, source.empty, prepared, turn)
+            found = self._match_turned(magnified(source.image, zoom), source.empty, prepared, turn, zoom)
             tried.append(_judge(turn, found, source.grid, target.grid, tolerance, seed))
             advance(1)
         best = max(tried, key=lambda o: (o.count, float(o.found.score.sum())))
@@ -110,6 +114,7 @@ class KeypointMatcher:
         report: dict[str, Any] = {
             "method": self.name,
             "cell_m": [source.grid.cell, target.grid.cell],
+            "zoom": zoom,
             "turns_deg": [round(float(np.degrees(o.turn)), 1) for o in tried],
             "turn_matches": [len(o.found) for o in tried],
             "turn_agreeing": [int(o.agreeing.sum()) for o in tried],
@@ -136,18 +141,34 @@ class KeypointMatcher:
             return [yaw]
         return [2 * np.pi * k / self.turns for k in range(self.turns)]
 
-    def _match_turned(self, image: Grey, empty: int, target: Any, turn: float) -> PixelMatches:
+    def _match_turned(self, image: Grey, empty: int, target: Any, turn: float, zoom: float) -> PixelMatches:
         turned, back = turn_image(image, turn, empty)
         found = self.images.match(self.images.prepare(turned, empty), target)
+
+        def shrunk(px: Floats) -> Floats:
+            return np.asarray((px + 0.5) / zoom - 0.5)
+
         return one_to_one(
             PixelMatches(
-                _affine(back, found.source_px),
-                found.target_px,
+                shrunk(_affine(back, found.source_px)),
+                shrunk(found.target_px),
                 np.clip(found.score, 0.0, 1.0),
-                _affine(back, found.source_keypoints),
-                found.target_keypoints,
+                shrunk(_affine(back, found.source_keypoints)),
+                shrunk(found.target_keypoints),
             )
         )
+
+
+def magnified(image: Grey, zoom: float) -> Grey:
+    """Magnify a (h, w) uint8 image, with pixel (c, r) going to ``(c + 0.5) * zoom - 0.5`` and so on."""
+    if zoom == 1.0:
+        return image
+    height, width = image.shape
+    size = (round(width * zoom), round(height * zoom))
+    M = np.array([[zoom, 0.0, 0.5 * zoom - 0.5], [0.0, zoom, 0.5 * zoom - 0.5]])
+    # not cv2.resize, which would round the scale to whole pixels
+    bigger = cv2.warpAffine(image, M, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(bigger, np.uint8)
 
 
 def turn_image(image: Grey, turn: float, fill: int) -> tuple[Grey, Floats]:
@@ -215,10 +236,10 @@ def _hypotheses(tried: list[Orientation]) -> tuple[Hypothesis, ...]:
 
 
 def margin_of(hypotheses: tuple[Hypothesis, ...]) -> float:
-    """Give how many times more matches agree on the best pose than on the next, 1000 at most.
+    """Give how many times more matches agree on the best pose than on the next, if any do.
 
     Repetitive scenes, such as rows of like houses, give several poses that many matches agree on.
     """
-    if len(hypotheses) < 2:
-        return LARGEST_MARGIN if hypotheses else 1.0
-    return min(hypotheses[0].score / hypotheses[1].score, LARGEST_MARGIN)
+    if not hypotheses:
+        return 1.0
+    return hypotheses[0].score / (hypotheses[1].score if len(hypotheses) > 1 else 1.0)

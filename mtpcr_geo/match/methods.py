@@ -95,23 +95,26 @@ def make_matcher(name: str, correlation: CorrelationSettings, keypoints: Keypoin
     """
     if name == "correlation":
         return CorrelationMatcher(correlation)
-    return KeypointMatcher(name, _images(name, keypoints), keypoints.turns, keypoints.tolerance_m)
+    images, magnify_to = _images(name, keypoints)
+    return KeypointMatcher(name, images, keypoints.turns, keypoints.tolerance_m, magnify_to)
 
 
-def _images(name: str, settings: KeypointSettings) -> ImageMatcher:
+def _images(name: str, settings: KeypointSettings) -> tuple[ImageMatcher, int]:
+    """Make what pairs pixels, and give the edge to which it wants small images magnified."""
     ratio = RATIO if settings.ratio is None else settings.ratio
     if name in ("rootsift", "orb"):
         most = settings.max_keypoints or 8192
         extractor: Extractor = RootSift(most) if name == "rootsift" else Orb(most)
         nearest = NearestNeighbours(ratio, bool(settings.cross_check))
-        return FeatureMatcher(extractor, nearest, any_yaw=True)
+        return FeatureMatcher(extractor, nearest, any_yaw=True), 0
     folder = models_folder(settings.models)
     known = descriptions(folder)
     if name not in known:
         from mtpcr_geo.pipeline.words import meant
 
         raise OptionError(f"there is no matcher {name!r}{meant(name, [*BUILT_IN, *known])}")
-    return _learned(known[name], folder, settings)
+    model = known[name]
+    return _learned(model, folder, settings), model.extractor.magnify_to if model.extractor else 0
 
 
 def _learned(model: ModelDescription, folder: Path | None, settings: KeypointSettings) -> ImageMatcher:

@@ -34,6 +34,9 @@ class ExtractorFile(_Part):
     descriptor_dim: int = Field(ge=1, description="length of a descriptor")
     max_keypoints: int = Field(4096, ge=1, description="keypoints kept of an image")
     tile: int = Field(1024, ge=64, description="edge of the tiles that larger images are cut into, pixels")
+    magnify_to: int = Field(
+        0, ge=0, description="smaller images are magnified to this edge, at most twice; 0 for never"
+    )
     channels: Literal[1, 3] = Field(1, description="grey, or grey three times over")
     mean: float = Field(0.0, description="taken from grey / 255 before the graph sees it")
     std: float = Field(1.0, gt=0, description="by which the rest is divided")

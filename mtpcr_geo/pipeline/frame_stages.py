@@ -143,6 +143,9 @@ class BevOptions(StageOptions):
         allow_inf_nan=False,
         description="edge of a raster cell in metres; chosen from both clouds' densities if not given",
     )
+    finest: float = Field(
+        1.0, ge=0.25, le=8, allow_inf_nan=False, description="no finer cell is chosen than this, metres"
+    )
     resolution: Literal["common", "eq1", "eq1_occupied"] = Field(
         "common",
         description="one cell for both clouds, or a cell of its own for each by the paper's Eq. 1, from "
@@ -211,7 +214,7 @@ class MakeBev(Stage):
         from mtpcr_geo import paper
         from mtpcr_geo.bev import choose_cell
 
-        usual = self.options.cell or choose_cell(*densities)
+        usual = self.options.cell or choose_cell(*densities, finest=self.options.finest)
         if self.options.resolution == "common":
             return [usual] * len(sides)
         areas = [dense.area_m2 for dense in densities]

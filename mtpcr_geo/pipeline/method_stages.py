@@ -197,7 +197,7 @@ class Refine(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Refine the solved transform."""
-        from mtpcr_geo.refine import constrain, icp, reaches_for, settle_on_ground
+        from mtpcr_geo.refine import beyond_scatter, constrain, icp, reaches_for, settle_on_ground
 
         pair = self.one_pair(inputs)
         if pair.T_target_source is None:
@@ -222,7 +222,9 @@ class Refine(Stage):
             T, report["icp"] = refined.T, refined.report
         if self.options.ground:
             settled = settle_on_ground(source, target, T, tilt=False)
-            T, report["ground_after"] = settled.T, settled.report
+            followed = self.options.method == "none" or beyond_scatter(settled)
+            report["ground_after"] = {**settled.report, "followed": followed}
+            T = settled.T if followed else T
         if self.options.motion != "rigid" and pair.ties is not None:
             T_work_level = geometry.inverse(pair.source.T_level_work)
             pivot = geometry.apply(T_work_level, pair.ties.source.mean(axis=0, keepdims=True))[0]
@@ -238,7 +240,8 @@ class AssessOptions(StageOptions):
     tolerance: float | None = Field(
         None,
         gt=0,
-        description="plan distance within which a withheld tie agrees, metres; one cell if not given",
+        description="plan distance within which a withheld tie agrees, metres; if not given one cell, or two "
+        "for keypoint matchers",
     )
     surprise: float = Field(
         6.0, ge=0, description="digits of improbability of the withheld ties' agreement wanted to accept"
