@@ -23,12 +23,16 @@ FIRST_REACH_M = 3.0
 MOST_CUBES = 30_000_000
 STILL_RAD = 4e-6
 STILL_M = 1e-4
+DENSE_CUBES = 2.5
+"""Points a cube of the thinning above which cubes give their mean point, and below which all are taken."""
+
 LATTICE_M = 0.00037
 """Shift of the thinning's cubes off whole millimetres, where points of a LAS scale lie in numbers."""
 FEWEST_GROUND_CELLS = 30
 CORRELATED_CELLS = 50
 GROUND_NOISE_M = 0.5
 LEVEL_SIGMA_DEG = 1.0
+SCATTER_SHARE, SCATTER_M = 0.5, 0.03
 
 
 @dataclass(frozen=True)
@@ -81,19 +85,20 @@ def icp(
 
     moved = geometry.apply(T_start, source)
     overlap = overlap_of(moved, target)
-    of_source = np.flatnonzero(overlap.select(moved))
-    s, t = moved[of_source], target[overlap.select(target)]
+    of_source, of_target = (np.flatnonzero(overlap.select(xyz)) for xyz in (moved, target))
+    s, t = moved[of_source], target[of_target]
     if min(len(s), len(t)) >= FEWEST_POINTS:
-        near = _near(s, t, reach_m[0])
-        s, of_source, t = s[near], of_source[near], t[_near(t, s[near], reach_m[0])]
+        near_s, near_t = _near(s, t, reach_m[0]), _near(t, s, reach_m[0])
+        of_source, of_target = of_source[near_s], of_target[near_t]
+        s, t = source[of_source], target[of_target]
     if min(len(s), len(t)) < FEWEST_POINTS:
         raise RegistrationError(
             f"only {min(len(s), len(t))} points of one cloud lie in the overlap, too few to refine"
         )
     pivot = np.floor(t.mean(axis=0))
     # each cloud is thinned in its own frame, so that a hair's breadth at the start changes no point
-    s = geometry.apply(T_start, _thinned(source[of_source], voxel_m, most_points))
-    t = _thinned(t, voxel_m, 3 * most_points)
+    s = geometry.apply(T_start, _thinned(source[of_source], of_source, voxel_m, most_points))
+    t = _thinned(t, of_target, voxel_m, 3 * most_points)
     ps, pt = small_gicp.PointCloud(s - pivot), small_gicp.PointCloud(t - pivot)
     tree = small_gicp.KdTree(pt, threads)
     if method != "point_to_point":
@@ -154,25 +159,42 @@ def _near(points: Floats, others: Floats, reach: float) -> NDArray[np.bool_]:
     return np.asarray(filled[tuple(np.floor((points - low) / edge).astype(np.int64).T)])
 
 
-def _thinned(xyz: Floats, voxel: float, most: int) -> Floats:
-    """Give one mean point a cube of (n, 3) points, (m, 3), m at most a number.
+def _thinned(xyz: Floats, number: NDArray[np.int64], voxel: float, most: int) -> Floats:
+    """Thin (n, 3) points to at most so many, (m, 3), in a way that hangs on the points and not on the frame.
 
-    Where cubes are too many, each is kept or left by a hash of its place: if a cube comes or goes, the
-    choice among all others stays.
+    Dense clouds give one mean point a cube. Where cubes would hold hardly more than a point each, the
+    points are taken as they are, since a lattice of cubes in another CRS would cut them otherwise. What is
+    too many is left out by a hash of the cube, or of the point's number: if one comes or goes, the choice
+    among all others stays.
+
+    Args:
+        xyz: points, metres.
+        number: (n,) the points' numbers in their cloud.
+        voxel: edge of a cube, metres.
+        most: points at most.
+
     """
     import small_gicp
 
     first = np.floor(geometry.bounds(xyz)[0] / voxel) - 1
     corner = first * voxel + LATTICE_M
     thin = np.asarray(small_gicp.voxelgrid_sampling(xyz - corner, voxel, 1).points())[:, :3]
+    if len(xyz) < DENSE_CUBES * len(thin):
+        names, thin = number[:, None], xyz - corner
+    else:
+        names = (np.floor(thin / voxel) + first).astype(np.int64)
     if len(thin) > most:
-        cube = (np.floor(thin / voxel) + first).astype(np.int64).astype(np.uint64)
-        key = np.zeros(len(thin), np.uint64)
-        for axis in range(3):
-            key = (key ^ cube[:, axis]) * np.uint64(0x9E3779B97F4A7C15)
-            key ^= key >> np.uint64(29)
-        thin = thin[np.sort(np.argpartition(key, most)[:most])]
+        thin = thin[np.sort(np.argpartition(_hash(names), most)[:most])]
     return thin + corner
+
+
+def _hash(names: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """Scatter (n, k) whole numbers over 64 bits: (n,)."""
+    key = np.zeros(len(names), np.uint64)
+    for column in names.T.astype(np.uint64):
+        key = (key ^ column) * np.uint64(0x9E3779B97F4A7C15)
+        key ^= key >> np.uint64(29)
+    return key
 
 
 def reaches_for(cell: float) -> tuple[float, ...]:
@@ -239,6 +261,18 @@ def settle_on_ground(
         "tilt_deg": float(np.degrees(geometry.rotation_angle(R))),
     }
     return Refinement(T, report)
+
+
+def beyond_scatter(settled: Refinement) -> bool:
+    """Tell whether the ground's rise is more than where the borders of its cells run can make of it.
+
+    The lowest of a cell lies the lower the denser the cloud and the steeper the ground, by a part of the
+    cells' own scatter. A fit to all points knows the height better than that.
+    """
+    report = settled.report
+    if "rise_m" not in report:
+        return False
+    return bool(abs(report["rise_m"]) > min(SCATTER_SHARE * report["ground_spread_m"], SCATTER_M))
 
 
 def constrain(T: Floats, motion: Motion, pivot: Floats, R_upright: Floats) -> Floats:
