@@ -9,6 +9,7 @@ import numpy as np
 from mtpcr_geo import geometry
 from mtpcr_geo.assess import Evidence
 from mtpcr_geo.chance import chance_within
+from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.errors import RegistrationError
 from mtpcr_geo.overlap import overlap_of
 from mtpcr_geo.scene import Floats, Pair, Ties
@@ -63,7 +64,9 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         final_agreeing=int((residual < tolerance).sum()),
     )
     shift = T[:3, 3]
+    offset = TransformChain.of(pair).vertical_offset_m
     more = {
+        **({} if offset is None else {"vertical_offset_m": offset}),
         "yaw_deg": float(np.degrees(geometry.yaw_of(T[:3, :3]))),
         "tilt_deg": float(np.degrees(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))),
         "shift_work_m": [float(v) for v in shift],

@@ -6,8 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from mtpcr_geo import geometry
 
 if TYPE_CHECKING:
@@ -19,6 +17,7 @@ if TYPE_CHECKING:
 _COLOUR = {"accepted": "bold green", "doubtful": "bold yellow", "refused": "bold red"}
 # the numbers most worth a look; --verbose shows all
 _SHOWN = (
+    "vertical_offset_m",
     "overlap_m2",
     "overlap_source",
     "overlap_target",
@@ -77,18 +76,16 @@ def _transform_rows(result: Registration) -> list[tuple[str, str]]:
     pair = result.pair
     if pair is None or pair.T_target_source is None or result.T_target_source is None:
         return []
-    from mtpcr_geo.crs import TransformChain
+    from mtpcr_geo.export.story import result_text, shift_text
 
-    T = result.T_target_source
-    middle = (pair.source.cloud.minimum + pair.source.cloud.maximum) / 2
-    shift = TransformChain.of(pair).forward(middle[np.newaxis])[0] - middle
-    yaw = math.degrees(geometry.yaw_of(T[:3, :3]))
-    upright = geometry.yaw_matrix(geometry.yaw_of(T[:3, :3]))
-    tilt = math.degrees(geometry.rotation_angle(upright.T @ T[:3, :3]))
-    return [
-        ("yaw", f"{yaw:+.3f} degrees, tilt {tilt:.3f}"),
-        ("shift of the middle", f"{shift[0]:+.2f}, {shift[1]:+.2f}, {shift[2]:+.2f} (x, y, z)"),
-    ]
+    R = pair.T_target_source[:3, :3]
+    yaw = geometry.yaw_of(R)
+    tilt = math.degrees(geometry.rotation_angle(geometry.yaw_matrix(yaw).T @ R))
+    rows = [("yaw", f"{math.degrees(yaw):+.3f} degrees, tilt {tilt:.3f}")]
+    shift = shift_text(pair)
+    if shift:
+        rows.append(("shift of the middle", shift))
+    return [*rows, ("result in", result_text(pair))]
 
 
 def _metric_rows(metrics: Mapping[str, Any], verbose: bool) -> list[tuple[str, str]]:

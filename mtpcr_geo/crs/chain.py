@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo import geometry
+from mtpcr_geo.crs.facts import facts_of
 from mtpcr_geo.crs.link import FrameLink, box_points, fit_affine
 
 if TYPE_CHECKING:
@@ -64,6 +65,23 @@ class TransformChain:
     def inverse(self, xyz: Floats) -> Floats:
         """Take (n, 3) target file coordinates to (n, 3) source file coordinates."""
         return self.source.to_file(geometry.apply(self.T_source_target, self.target.to_work(xyz)))
+
+    @property
+    def shift_m(self) -> Floats | None:
+        """(3,) metres by which the pivot leaves the place that its CRS claims; None for a local source."""
+        if any(facts_of(link.file_crs).kind == "local" for link in (self.source, self.target)):
+            return None
+        before = self.source.to_work(self.pivot[None])
+        after = geometry.apply(self.T_target_source, before)
+        return np.asarray((after - before)[0] + (self.target.origin - self.source.origin))
+
+    @property
+    def vertical_offset_m(self) -> float | None:
+        """Metres added to the source's heights, where that was to be estimated; None elsewhere."""
+        shift = self.shift_m
+        if shift is None or self.source.report.get("vertical") != "estimate":
+            return None
+        return float(shift[2])
 
     @property
     def T_source_target(self) -> Floats:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mtpcr_geo import __version__, draw
+from mtpcr_geo.crs import TransformChain
 from mtpcr_geo.errors import OutputError
 from mtpcr_geo.export import charts, story
 from mtpcr_geo.export.ties import footprints, tie_positions
@@ -199,13 +200,14 @@ def _tie_charts(pair: Pair) -> list[str]:
 def _transform(pair: Pair) -> str:
     if pair.T_target_source is None:
         return "<p>No transform was found.</p>"
-    crs = pair.target.link.file_crs
-    frame = f"{crs.name}" if crs is not None else "local, the target file's coordinates"
-    departure = max(getattr(pair.source.link, "departure", 0.0), getattr(pair.target.link, "departure", 0.0))
+    departure = TransformChain.of(pair).departure
     exact = "" if departure == 0 else f" It is a best fit here, off by up to {departure:.3g} m."
+    source = pair.source.link
+    start = source.file_crs.name if source.file_crs is not None else "local coordinates"
     parts = [
         "<h3>On the coordinates as they stand in the files</h3>",
-        f"<p>Takes source coordinates (x, y, z, 1) to target coordinates; frame: {escape(frame)}.{exact}</p>",
+        f"<p>Takes source coordinates (x, y, z, 1) in {escape(start)}: {escape(story.units_text(source))}, "
+        f"to {escape(story.result_text(pair))}.{exact}</p>",
         f"<pre>{story.matrix_text(pair.T_file)}</pre>",
     ]
     example = story.worked_example(pair)
@@ -219,8 +221,9 @@ def _transform(pair: Pair) -> str:
         f"{side.role} {', '.join(f'{value:.0f}' for value in side.link.origin)}"
         for side in (pair.source, pair.target)
     )
+    work = pair.frame.crs.name if pair.frame.crs is not None else "local"
     parts += [
-        "<h3>In the work frame</h3>",
+        f"<h3>In the work frame: {escape(work)}</h3>",
         "<p>Metres, on coordinates from which each cloud's work origin was taken away first "
         f"({escape(origins)}).</p><pre>{story.matrix_text(pair.T_target_source)}</pre>",
     ]

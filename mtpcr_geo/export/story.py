@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 
 from mtpcr_geo import geometry
+from mtpcr_geo.crs import FrameLink, TransformChain, facts_of
 from mtpcr_geo.export.ties import tie_positions
+from mtpcr_geo.export.transform import units_of
 from mtpcr_geo.scene import Floats, Pair, Side, Verdict
 
 Row = tuple[str, str]
@@ -49,6 +51,8 @@ def side_rows(side: Side) -> list[Row]:
         ("file", Path(cloud.name).name),
         ("points", f"{cloud.count:,}"),
         ("CRS", crs),
+        ("units", units_text(side.link)),
+        *_way_rows(side.link),
         ("extent", f"{extent[0]:.1f} × {extent[1]:.1f} m, {extent[2]:.1f} m high"),
         ("work origin", ", ".join(f"{value:.0f}" for value in side.link.origin) + " m"),
     ]
@@ -69,12 +73,13 @@ def transform_rows(pair: Pair) -> list[Row]:
     yaw = geometry.yaw_of(R)
     tilt = math.degrees(geometry.rotation_angle(geometry.yaw_matrix(yaw).T @ R))
     rows = [("yaw", f"{math.degrees(yaw):+.4f}° (counter-clockwise from above)"), ("tilt", f"{tilt:.4f}°")]
-    example = worked_example(pair)
-    if example is not None:
-        before, after = example
-        if pair.source.link.file_crs is not None or pair.target.link.file_crs is None:
-            shift = after - before
-            rows.append(("the middle moves by", f"{_numbers(shift, 3, sign=True)} (x, y, z in file units)"))
+    moved = shift_text(pair)
+    if moved:
+        rows.append(("the middle moves by", moved))
+    rows.append(("result in", result_text(pair)))
+    offset = TransformChain.of(pair).vertical_offset_m
+    if offset is not None:
+        rows.append(("height offset found", f"{offset:+.3f} m, added to the source's heights"))
     if pair.ties is not None and len(pair.ties.target):
         inlier = np.asarray(pair.ties.inlier, bool)
         rows.append(("ties", f"{len(inlier)}, of which {int(inlier.sum())} agree with the transform"))
@@ -85,17 +90,57 @@ def transform_rows(pair: Pair) -> list[Row]:
     return rows
 
 
+def units_text(link: FrameLink) -> str:
+    """Name the units of a file's coordinates, across and up, and what its heights count from."""
+    across, _, up = units_of(link)
+    units = across if across == up else f"{across} across, {up} up"
+    return f"{units}; {facts_of(link.file_crs).height_name}"
+
+
+def shift_text(pair: Pair) -> str:
+    """Say how far the source's middle moves: metres in the work frame, or in the files' local frame.
+
+    Empty where source and target share no frame, so that no shift has a meaning.
+    """
+    chain = TransformChain.of(pair)
+    shift = chain.shift_m
+    if shift is not None and pair.frame.crs is not None:
+        return f"{_numbers(shift, 3, sign=True)} m (east, north, up in {pair.frame.crs.name})"
+    if pair.source.link.file_crs is None and pair.target.link.file_crs is None:
+        shift = chain.forward(chain.pivot[None])[0] - chain.pivot
+        return f"{_numbers(shift, 3, sign=True)} m (x, y, z)"
+    return ""
+
+
+def result_text(pair: Pair) -> str:
+    """Name the CRS and the units of the registered cloud."""
+    link = pair.frame.output or pair.target.link
+    name = link.file_crs.name if link.file_crs is not None else "local coordinates of the target"
+    return f"{name}: {units_text(link)}"
+
+
+def _way_rows(link: FrameLink) -> list[Row]:
+    """Say how a file's coordinates come to the work frame, and what had to be assumed."""
+    report = link.report
+    rows = []
+    if "operation" in report:
+        accuracy = report.get("accuracy_m")
+        how = "accuracy not stated" if accuracy is None else f"good to {accuracy:g} m"
+        grids = ", ".join(report.get("grids", ()))
+        rows.append(("way to the work frame", f"{report['operation']} ({how}{'; ' if grids else ''}{grids})"))
+    return rows + [("note", note) for note in report.get("notes", ())]
+
+
 def worked_example(pair: Pair) -> tuple[Floats, Floats] | None:
     """Give one point, the middle of the source, before and after: (3,) source and target file coordinates.
 
-    The way goes through both links, not through the single 4x4, so it can serve to check that.
+    The way goes through the whole chain, not through the single 4x4, so it can serve to check that.
     """
     if pair.T_target_source is None:
         return None
     middle = (pair.source.cloud.minimum + pair.source.cloud.maximum) / 2
     before: Floats = np.asarray(np.round(middle, 3), np.float64)
-    work = geometry.apply(pair.T_target_source, pair.source.link.to_work(before[np.newaxis]))
-    return before, np.asarray(pair.target.link.to_file(work)[0])
+    return before, TransformChain.of(pair).forward(before[np.newaxis])[0]
 
 
 def misfits(pair: Pair) -> Floats:

@@ -52,14 +52,14 @@ def write_transform_json(path: str | Path, pair: Pair) -> None:
             if chain.is_affine
             else "T_target_source is the best fit within the source's bounds; the chain is exact",
         },
-        "units": {"source": _units(chain.source), "target": _units(chain.target)},
+        "units": {"source": units_of(chain.source), "target": units_of(chain.target)},
         "pivot": {
             "source": chain.pivot,
             "target": chain.forward(chain.pivot[None])[0],
             "linear": T[:3, :3],
             "note": "target = linear (x - source pivot) + target pivot loses no digits far from the origin",
         },
-        "motion": _motion(chain, work is not None and pair.source.link.file_crs is not None),
+        "motion": _motion(chain),
         "work": {
             "crs": _crs(work),
             "units": "metre",
@@ -171,6 +171,23 @@ def read_transform(path: str | Path) -> TransformChain:
     return result
 
 
+def frames_of(pair: Pair) -> dict[str, Any]:
+    """Say in which CRSs and units source, target and result stand, and how each comes to the work frame."""
+    links = {"source": pair.source.link, "target": pair.target.link}
+    links["result"] = pair.frame.output or pair.target.link
+    frames: dict[str, Any] = {
+        role: {"crs": _crs(link.file_crs, wkt=False), "units": units_of(link), **link.report}
+        for role, link in links.items()
+    }
+    frames["work"] = {
+        "crs": _crs(pair.frame.crs, wkt=False),
+        "units": ["metre"] * 3,
+        "source_origin": pair.source.link.origin.tolist(),
+        "target_origin": pair.target.link.origin.tolist(),
+    }
+    return frames
+
+
 def dumps(value: Any, indent: int = 0) -> str:
     """Write JSON with 17 significant digits, and the rows of a matrix in a line each."""
     pad = "  " * (indent + 1)
@@ -208,7 +225,7 @@ def _examples(pair: Pair, chain: TransformChain) -> Floats:
     return chain.source.to_file(sample[np.unique(np.linspace(0, len(sample) - 1, 4).astype(int))])
 
 
-def _motion(chain: TransformChain, georeferenced: bool) -> dict[str, Any]:
+def _motion(chain: TransformChain) -> dict[str, Any]:
     R = chain.T_target_source[:3, :3]
     motion: dict[str, Any] = {
         "rotation_deg": float(np.degrees(geometry.rotation_angle(R))),
@@ -216,33 +233,29 @@ def _motion(chain: TransformChain, georeferenced: bool) -> dict[str, Any]:
         "tilt_deg": float(np.degrees(np.arctan2(np.hypot(R[0, 2], R[1, 2]), R[2, 2]))),
         "note": "in the work frame; yaw counter-clockwise seen from above",
     }
-    if georeferenced:
-        before = chain.source.to_work(chain.pivot[None])
-        after = geometry.apply(chain.T_target_source, before)
-        origins = chain.target.origin - chain.source.origin
-        motion["shift_of_pivot_m"] = (after - before)[0] + origins
+    shift = chain.shift_m
+    if shift is not None:
+        motion["shift_of_pivot_m"] = shift
         motion["vertical"] = chain.source.report.get("vertical", "")
-        if motion["vertical"] == "estimate":
-            motion["vertical_offset_m"] = float(motion["shift_of_pivot_m"][2])
+        if chain.vertical_offset_m is not None:
+            motion["vertical_offset_m"] = chain.vertical_offset_m
     return motion
 
 
-def _units(link: FrameLink) -> list[str]:
+def units_of(link: FrameLink) -> list[str]:
+    """Name the units of x, y and z in a file."""
     if link.file_crs is None:
         return ["metre"] * 3
     facts = facts_of(link.file_crs)
     return [facts.unit_name, facts.unit_name, facts.height_unit_name]
 
 
-def _crs(crs: CRS | None) -> dict[str, Any] | None:
+def _crs(crs: CRS | None, wkt: bool = True) -> dict[str, Any] | None:
     if crs is None:
         return None
     authority = crs.to_authority()
-    return {
-        "name": crs.name,
-        "authority": ":".join(authority) if authority else None,
-        "wkt": crs.to_wkt("WKT2_2019"),
-    }
+    said = {"name": crs.name, "authority": ":".join(authority) if authority else None}
+    return said | {"wkt": crs.to_wkt("WKT2_2019")} if wkt else said
 
 
 def _link(link: FrameLink) -> dict[str, Any]:

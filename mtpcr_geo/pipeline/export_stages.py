@@ -255,6 +255,8 @@ def run_facts(pair: Pair | None, context: RunContext) -> dict[str, Any]:
     verdict = pair.verdict if pair else None
     if verdict is None and context.failure is not None:
         verdict = Verdict("refused", (context.failure,), {})
+    from mtpcr_geo.export.transform import frames_of
+
     seconds = {entry["tag"]: round(entry["seconds"], 4) for entry in context.done}
     return {
         "verdict": verdict.name if verdict else None,
@@ -262,6 +264,7 @@ def run_facts(pair: Pair | None, context: RunContext) -> dict[str, Any]:
         "metrics": verdict.metrics if verdict else {},
         # found, which says nothing of whether to use it: that is the verdict
         "T_target_source": pair.T_file if pair is not None and pair.T_target_source is not None else None,
+        "frames": frames_of(pair) if pair is not None else None,
         "time_s": {**seconds, "total": round(time.perf_counter() - context.facts["started"], 4)},
         "peak_memory_mb": peak_memory_mb(),
         "options": {entry["tag"]: entry["options"] for entry in context.done},
