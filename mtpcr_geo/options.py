@@ -1,4 +1,4 @@
-"""The options of a whole registration: what the command and `register` take."""
+"""The options of a whole registration: what the command, `register` and the stage mtpcr.register take."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 
-class RegisterOptions(BaseModel):
-    """Options of a registration; the same words as on the command line."""
+class MethodOptions(BaseModel):
+    """Options of everything from levelling to verdict; the same words as on the command line."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -55,6 +55,11 @@ class RegisterOptions(BaseModel):
     focus: bool = Field(True, description="paper's profile: match again where the overlap is small (FOCUS)")
     enhance: bool = Field(True, description="paper's profile: sharpen the images (Eq. 4)")
     seed: int = Field(0, ge=0, description="seed of everything random")
+
+
+class RegisterOptions(MethodOptions):
+    """Options of a registration: of the method, and of what it leaves."""
+
     recording: bool = Field(True, description="keep a recording of the run for the rerun viewer")
     force: bool = Field(False, description="write the registered cloud though the verdict refuses it")
     overwrite: bool = Field(False, description="replace files that are already there")

@@ -18,10 +18,8 @@ from mtpcr_geo.pipeline import grammar
 from mtpcr_geo.pipeline.registry import first_problem
 from mtpcr_geo.pipeline.runner import RunResult, Settings, execute
 from mtpcr_geo.pipeline.stage import Progress
+from mtpcr_geo.pipeline.steps import steps_of, without_defaults
 from mtpcr_geo.scene import Floats, Pair, Verdict
-
-MANY_TRIES = 20_000
-"""Pairs of ties tried for the robust start with keypoint matchers, of whose matches few may be right."""
 
 
 @dataclass(frozen=True)
@@ -78,23 +76,10 @@ def build_pipeline(
     """Name the stages of a registration, as pipeline JSON."""
     folder = Path(out)
     where = {name: str(folder / file) for name, file in OUTPUT_NAMES.items()}
-    seed = {"seed": options.seed} if options.seed else {}
     stages: list[dict[str, Any]] = [
         _reader(target, "target"),
         _reader(source, "source"),
-        {
-            "type": "mtpcr.level",
-            "tag": "level",
-            "inputs": ["target", "source"],
-            "method": "ransac" if options.profile == "paper" and options.level == "auto" else options.level,
-            "target_crs": options.target_crs,
-            "source_crs": options.source_crs,
-            "local": options.local,
-            "vertical": None if options.vertical == "refuse" else options.vertical,
-            "out_crs": options.out_crs,
-            **seed,
-        },
-        *(_paper_method(options, seed) if options.profile == "paper" else _method(options, seed)),
+        *steps_of(options, inputs=["target", "source"]),
         {"type": "mtpcr.write_bev", "tag": "rasters", "filename": where["bev"]},
         {"type": "mtpcr.write_ties", "tag": "ties", "filename": where["ties"]},
         *(
@@ -111,57 +96,7 @@ def build_pipeline(
         stages.insert(
             before, {"type": "mtpcr.write_recording", "tag": "recording", "filename": where["recording"]}
         )
-    return [_without_defaults(stage) for stage in stages]
-
-
-def _method(options: RegisterOptions, seed: dict[str, int]) -> list[dict[str, Any]]:
-    """Name the steps from raster to verdict."""
-    for name in ("res", "focus", "enhance"):
-        if not getattr(options, name):
-            raise OptionError(f"--no-{name} belongs to --profile paper")
-    correlation = options.matcher in (None, "correlation")
-    match = {} if correlation else {"method": options.matcher, "models": _models(options)}
-    # learned keypoints like fine detail, where the points are dense enough to show it
-    finest = None if correlation or options.matcher in ("rootsift", "orb") else 0.5
-    return [
-        {"type": "mtpcr.bev", "tag": "bev", "cell": options.cell, "finest": finest},
-        {"type": "mtpcr.match", "tag": "match", **match, **_prior(options), **seed},
-        {"type": "mtpcr.lift", "tag": "lift", **seed},
-        {"type": "mtpcr.solve", "tag": "solve", "tries": None if correlation else MANY_TRIES, **seed},
-        {
-            "type": "mtpcr.refine",
-            "tag": "refine",
-            "motion": None if options.motion == "rigid" else options.motion,
-        },
-        {"type": "mtpcr.assess", "tag": "assess"},
-    ]
-
-
-def _paper_method(options: RegisterOptions, seed: dict[str, int]) -> list[dict[str, Any]]:
-    """Name the steps from raster to verdict as MT-PCR has them."""
-    if options.prior != "none" or options.motion != "rigid":
-        raise OptionError("--prior and --motion are not of the paper; leave them out, or --profile paper")
-    # without RES coordinates stay metres, and Eq. 2 makes pixels of one
-    res = {"cell": options.cell, "resolution": "eq1"} if options.res else {"cell": options.cell or 1.0}
-    matcher = options.matcher or "superpoint"
-    steps: list[dict[str, Any]] = [
-        {"type": "mtpcr.bev", "tag": "bev", **res, "pixel": "ceil"},
-        {"type": "mtpcr.enhance", "tag": "enhance", "look": "paper" if options.enhance else "grey"},
-        {"type": "mtpcr.match", "tag": "match", "method": matcher, "models": _models(options), **seed},
-    ]
-    if options.focus:
-        steps.append({"type": "mtpcr.focus", "tag": "focus", **seed})
-    return [
-        *steps,
-        {"type": "mtpcr.lift", "tag": "lift", "surface": "grey", "pixel": "ceil", **seed},
-        {"type": "mtpcr.solve", "tag": "solve", "upright": False, "robust_start": False, **seed},
-        {"type": "mtpcr.refine", "tag": "refine", "method": "point_to_point", "ground": False},
-        {"type": "mtpcr.assess", "tag": "assess"},
-    ]
-
-
-def _models(options: RegisterOptions) -> str | None:
-    return None if options.models is None else str(options.models)
+    return [without_defaults(stage) for stage in stages]
 
 
 def read_options(options: dict[str, Any]) -> RegisterOptions:
@@ -188,21 +123,6 @@ def registration_of(result: RunResult) -> Registration:
     return Registration(verdict, T, pair, outputs, result.done)
 
 
-def _prior(options: RegisterOptions) -> dict[str, Any]:
-    if options.prior == "none":
-        return {}
-    return {"prior": options.prior, "prior_sigma": options.prior_sigma, "prior_yaw": options.prior_yaw}
-
-
 def _reader(path: str | Path, tag: str) -> dict[str, Any]:
     kind = "readers.copc" if str(path).lower().endswith(".copc.laz") else "readers.las"
     return {"type": kind, "tag": tag, "filename": str(path)}
-
-
-def _without_defaults(stage: dict[str, Any]) -> dict[str, Any]:
-    flags = ("force", "local")
-    return {
-        key: value
-        for key, value in stage.items()
-        if value is not None and not (key in flags and value is False)
-    }

@@ -4,50 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import Any, ClassVar
 
-from pydantic import Field
-
+from mtpcr_geo.options import MethodOptions
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
-
-_HANDED_ON = {
-    "level": ("method", "target_crs", "source_crs", "local", "vertical", "out_crs", "seed"),
-    "bev": ("cell",),
-    "match": ("prior", "prior_sigma", "prior_yaw", "seed"),
-    "lift": ("seed",),
-    "solve": ("seed",),
-    "refine": ("motion",),
-}
-METHOD = ("level", "bev", "match", "lift", "solve", "refine", "assess")
+from mtpcr_geo.pipeline.steps import steps_of
 
 
-class RegisterStageOptions(StageOptions):
-    """Options of mtpcr.register."""
-
-    level: Literal["auto", "ransac", "none"] = Field(
-        "auto", description="how to make the clouds upright; auto trusts georeferenced clouds"
-    )
-    cell: float | None = Field(
-        None, gt=0, allow_inf_nan=False, description="cell of the height rasters, metres; chosen if not given"
-    )
-    target_crs: str | None = Field(None, description="CRS of the first cloud, instead of what it states")
-    source_crs: str | None = Field(None, description="CRS of the second cloud, instead of what it states")
-    local: bool = Field(False, description="both clouds are local, in metres, whatever they state")
-    vertical: Literal["refuse", "assume-same", "estimate"] = Field(
-        "refuse", description="what to do with different or unknown vertical datums"
-    )
-    out_crs: str | None = Field(
-        None, description="CRS of the result, where it shall not be the first cloud's"
-    )
-    prior: Literal["none", "georef"] = Field(
-        "none", description="georef starts from where both clouds' CRSs put them, and searches only near it"
-    )
-    prior_sigma: float = Field(5.0, gt=0, description="standard deviation of the source's place, metres")
-    prior_yaw: float = Field(5.0, gt=0, le=180, description="largest turn from the prior considered, degrees")
-    motion: Literal["rigid", "yaw", "translation"] = Field(
-        "rigid", description="degrees of freedom of the result: all six, yaw and shift, or the shift alone"
-    )
-    seed: int = Field(0, ge=0, description="seed of everything random")
+class RegisterStageOptions(MethodOptions, StageOptions):
+    """Options of mtpcr.register: those of the method, from levelling to verdict."""
 
 
 class Register(Stage):
@@ -62,7 +27,7 @@ class Register(Stage):
 
     def __init__(self, options: StageOptions, tag: str) -> None:
         super().__init__(options, tag)
-        self.steps = [self._step(name) for name in METHOD]
+        self.steps = [self._step(words) for words in steps_of(self.options)]
 
     def check(self, context: RunContext) -> None:
         """Check every step."""
@@ -90,10 +55,9 @@ class Register(Stage):
         self.metadata["time_s"] = seconds
         return value
 
-    def _step(self, name: str) -> Stage:
+    def _step(self, words: dict[str, Any]) -> Stage:
         from mtpcr_geo.pipeline.registry import make_options, stage_types
 
-        kind = stage_types()[f"mtpcr.{name}"]
-        words = {**self.options.model_dump(), "method": self.options.level}
-        given = {key: words[key] for key in _HANDED_ON.get(name, ())}
-        return kind(make_options(self.label, kind.Options, given), f"{self.tag}_{name}")
+        kind = stage_types()[words["type"]]
+        given = {key: value for key, value in words.items() if key not in ("type", "tag", "inputs")}
+        return kind(make_options(self.label, kind.Options, given), f"{self.tag}_{words['tag']}")
