@@ -53,38 +53,27 @@ def binned(values: Sequence[float], right: Sequence[bool], edges: Sequence[float
     return out
 
 
-def draw_all(rows: Sequence[Row], folder: Path, note: str = "") -> list[Path]:
-    """Draw every plot that the runs allow, as PNG.
+def draw_all(rows: Sequence[Row], files: Mapping[str, Path], note: str = "") -> None:
+    """Draw plots as PNG.
 
     Args:
-        rows: runs.
-        folder: where to; it must exist.
+        rows: runs; at least one.
+        files: where each plot goes, by its name in `PLOTS`.
         note: printed small below each, such as what the data are.
-
-    Returns:
-        The files written.
 
     Raises:
         MissingPartError: if matplotlib is not installed.
 
     """
     plt = _pyplot()
-    jobs: Mapping[str, Callable[[Any, Sequence[Row]], None]] = {
-        "cumulative_errors.png": _draw_cumulative,
-        "success_overlap.png": _draw_overlap,
-        "success_yaw.png": _draw_yaw,
-    }
-    written = []
-    for name, draw in jobs.items():
-        wide = 10.0 if name.startswith("cumulative") else 6.4
+    for name, path in files.items():
+        wide = 10.0 if name == "cumulative_errors" else 6.4
         figure = plt.figure(figsize=(wide, 4.2), layout="constrained")
-        draw(figure, rows)
+        PLOTS[name](figure, rows)
         if note:
             figure.supxlabel(note, fontsize=7, color="0.4")
-        figure.savefig(Path(folder) / name, dpi=150)
+        figure.savefig(path, dpi=150)
         plt.close(figure)
-        written.append(Path(folder) / name)
-    return written
 
 
 def _draw_cumulative(figure: Any, rows: Sequence[Row]) -> None:
@@ -172,3 +161,10 @@ def _pyplot() -> Any:
     import matplotlib.pyplot as plt
 
     return plt
+
+
+PLOTS: dict[str, Callable[[Any, Sequence[Row]], None]] = {
+    "cumulative_errors": _draw_cumulative,
+    "success_overlap": _draw_overlap,
+    "success_yaw": _draw_yaw,
+}

@@ -119,7 +119,7 @@ def simulate_pair(
     site = make_site(kind, seed, extent_m)
     chance = np.random.default_rng([seed, 23])
     yaw = float(chance.uniform(-0.2, 0.2))
-    path = _walk(site, yaw)
+    path = walk_through(site, yaw)
     caster = Caster(site.mesh(0, leafiness[0]))
     if ground == "robot":
         beams = scanners.robot_beams(path, site.ground.height, ground_beams, chance, drift_m=drift_m)
@@ -129,13 +129,13 @@ def simulate_pair(
         beams = scanners.tripod_beams(stops, site.ground.height, ground_beams, chance)
         low = instruments.measure(caster, beams, instruments.TRIPOD, chance)
     low = low.part(np.abs(low.xyz[:, :2]).max(axis=1) < site.half + MARGIN_M - 2.0)
-    low = low.part(_thinned(low.xyz, voxel_m))
+    low = low.part(thinned(low.xyz, voxel_m))
     if not low.extra["GpsTime"].size:
         raise OptionError(
             f"the ground scan of {kind} {seed} saw nothing; send more beams than {ground_beams}"
         )
 
-    low, block, path = _shared(low, path, site, yaw, overlap)
+    low, block, path = shared_block(low, path, site, yaw, (overlap, overlap))
     if epochs_apart or leafiness[1] != leafiness[0]:
         caster = Caster(site.mesh(epochs_apart, leafiness[1]))
     fly = scanners.airborne_beams if air == "airborne" else scanners.uav_beams
@@ -185,7 +185,7 @@ def _check(kind: str, extent_m: float, overlap: float, density: float, ground: s
             raise OptionError(f"{name} is {number:g}; it must lie between {low:g} and {high:g}")
 
 
-def _walk(site: Site, yaw: float) -> Floats:
+def walk_through(site: Site, yaw: float) -> Floats:
     """Give the robot's way: through the quarter at the -x end, then on towards the +x end."""
     nodes = site.roads.nodes
     c, s = np.cos(yaw), np.sin(yaw)
@@ -202,26 +202,35 @@ def _walk(site: Site, yaw: float) -> Floats:
     return path
 
 
-def _shared(
-    low: instruments.Scan, path: Floats, site: Site, yaw: float, overlap: float
+def shared_block(
+    low: instruments.Scan, path: Floats, site: Site, yaw: float, shares: tuple[float, float]
 ) -> tuple[instruments.Scan, Block, Floats]:
-    """Find the block to fly over; a ground scan too large for the site is shortened at its ends."""
+    """Find the block to fly over; a ground scan too large for the site is shortened at its ends.
+
+    Args:
+        low: the ground scan.
+        path: (k, 2) its way, metres.
+        site: what is scanned.
+        yaw: turn of the block, radians.
+        shares: of the ground cloud and of the aerial cloud that shall be shared.
+
+    """
     time = np.asarray(low.extra["GpsTime"], np.float64)
     best: tuple[float, instruments.Scan, Block, Floats] | None = None
     for first, last in _SHORTER:
         part = low.part((time >= first * time.max()) & (time <= last * time.max()))
         if not len(part.xyz):
             continue
-        block, gap = place_block(occupied_cells(part.xyz), site.half, yaw, overlap, overlap)
+        block, gap = place_block(occupied_cells(part.xyz), site.half, yaw, *shares)
         if best is None or gap < best[0]:
             best = gap, part, block, path[int(first * len(path)) : max(2, int(last * len(path)))]
-        if gap < 0.25 * overlap:
+        if gap < 0.125 * sum(shares):
             break
     assert best is not None
     return best[1:]
 
 
-def _thinned(xyz: Floats, voxel: float) -> NDArray[np.int64]:
+def thinned(xyz: Floats, voxel: float) -> NDArray[np.int64]:
     """Give the numbers of the first points of each voxel, in their old order."""
     if voxel <= 0:
         return np.arange(len(xyz))
