@@ -88,7 +88,9 @@ def _draw_cumulative(figure: Any, rows: Sequence[Row]) -> None:
         for k, ((method,), own) in enumerate(grouped(rows, "method").items()):
             x, y = cumulative([row[key] for row in own if answered(row)], len(own))
             if len(x):
-                axis.step(np.maximum(x, 1e-3), y, where="post", label=method, **_style(k))
+                # from the axis up, and not below a millimetre or a thousandth of a degree
+                x, y = np.maximum(np.r_[x[0], x], 1e-3), np.r_[0.0, y]
+                axis.step(x, y, where="post", label=method, **_style(k))
         axis.axvline(limit, color="0.7", linewidth=1, zorder=0)
         axis.set(xscale="log", xlabel=unit, ylim=(0, 102))
         axis.grid(alpha=0.25)
@@ -104,8 +106,7 @@ def _draw_overlap(figure: Any, rows: Sequence[Row]) -> None:
     edges = [0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 60.0, 80.0, 100.0]
     edges = [edge for k, edge in enumerate(edges) if k == 0 or edges[k - 1] < top]
     _rates(axis, rows, lambda row: 100 * min(row["overlap_source"], row["overlap_target"]), edges)
-    axis.set(xlabel="overlap, % of the cloud that shares less", ylabel=_rate_name())
-    axis.invert_xaxis()
+    axis.set(xlabel="overlap, % of the cloud that shares less", ylabel=_rate_name(), xlim=(edges[-1], 0.0))
 
 
 def _draw_yaw(figure: Any, rows: Sequence[Row]) -> None:

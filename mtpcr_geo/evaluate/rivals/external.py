@@ -17,7 +17,8 @@ A JSON file describes it::
   "laz" (LAS 1.4, millimetres). Metres, z up, near the origin. ``crs`` (an EPSG code) is written into a LAZ.
 - ``voxel`` thins the clouds to a point per voxel of this edge, metres, before they are written.
 - The command writes the 4x4 that takes source to target as text to ``{result}``: the last sixteen numbers
-  of the file count, row by row. Lines of words before them do no harm.
+  of the file count, row by row. Lines of words before them do no harm. A scale in it is taken out, and
+  noted with the run.
 - An exit code other than 0, no result within the time limit, or more memory than allowed: a run without an
   answer, with the end of what the command printed as the reason. The memory limit is on the address space
   of each process; the memory reported is that of the command and all it started, sampled 20 times a second.
@@ -33,6 +34,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -40,6 +42,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from mtpcr_geo import geometry
 from mtpcr_geo.errors import OptionError
 from mtpcr_geo.evaluate import memory
 from mtpcr_geo.evaluate.methods import Estimate
@@ -101,7 +104,11 @@ class External:
                 write_points(path, xyz, self.description)
                 words[role] = str(path)
             words["result"] = str(folder / "result.txt")
-            return self._run(folder, words)
+            answer = self._run(folder, words)
+        if answer.T_target_source is None:
+            return answer
+        T, scale = rigid_part(answer.T_target_source, source.mean(axis=0))
+        return replace(answer, T_target_source=T, details={"scale": scale})
 
     def _run(self, folder: Path, words: dict[str, str]) -> Estimate:
         told = folder / "told.txt"
@@ -155,6 +162,22 @@ def read_matrix(path: Path) -> Floats:
     if not np.allclose(T[3], [0.0, 0.0, 0.0, 1.0]):
         raise ValueError(f"the last row is {T[3].tolist()}, not 0 0 0 1")
     return T
+
+
+def rigid_part(T: Floats, centroid: Floats) -> tuple[Floats, float]:
+    """Take the scale out of a similarity, keeping where it takes the source's centroid.
+
+    Args:
+        T: 4x4 similarity.
+        centroid: (3,) of the source, metres.
+
+    Returns:
+        The 4x4 rigid transform, and the scale.
+
+    """
+    R = geometry.orthonormal(T[:3, :3])
+    scale = float(np.cbrt(np.linalg.det(T[:3, :3])))
+    return geometry.compose(R, T[:3, :3] @ centroid + T[:3, 3] - R @ centroid), scale
 
 
 def write_points(path: Path, xyz: Floats, description: Description) -> None:
