@@ -425,6 +425,21 @@ def test_output_in_a_crs_of_choice(code, height):
     assert np.allclose(link.to_work(out), target_link.to_work(site()), atol=1e-6)
 
 
+def test_a_map_of_untrue_scale_says_so_and_takes_no_local_source():
+    local, metres = ArrayCloud(site() - PLACE), site()
+    for code, scale in ((25832, 0.9996), (3857, 1.5), (3034, 0.966)):
+        crs = CRS.from_epsg(code)
+        target = ArrayCloud(moved_to(crs, metres), crs)
+        _, link, _ = resolve_frames(target, target)
+        assert link.report["grid_scale"] == pytest.approx([scale, scale], rel=0.02)
+        assert any("off by that" in note for note in link.report["notes"]) == (code != 25832)
+        if code == 25832:
+            resolve_frames(target, local, source_crs="local")
+        else:
+            with pytest.raises(CrsError, match="no rigid transform fits both"):
+                resolve_frames(target, local, source_crs="local")
+
+
 def test_output_crs_needs_a_place_on_earth():
     cloud = ArrayCloud(site())
     with pytest.raises(CrsError, match="--out-crs"):

@@ -118,6 +118,24 @@ def area_of(facts: CrsFacts, points: Floats) -> AreaOfInterest | None:
     return AreaOfInterest(west, south, east, north)
 
 
+def grid_scale(crs: CRS, area: AreaOfInterest) -> tuple[float, float] | None:
+    """Give how long a metre of a projected CRS is drawn in the middle of an area, at least and at most.
+
+    None where PROJ cannot tell.
+    """
+    from pyproj import Proj
+    from pyproj.exceptions import ProjError
+
+    lon = (area.west_lon_degree + area.east_lon_degree) / 2
+    lat = (area.south_lat_degree + area.north_lat_degree) / 2
+    try:
+        factors = Proj(crs).get_factors(lon, lat)
+    except ProjError:
+        return None
+    found = float(factors.tissot_semiminor), float(factors.tissot_semimajor)
+    return found if np.isfinite(found).all() and min(found) > 0 else None
+
+
 def geographic_of(crs: CRS) -> CRS:
     """Give the geographic CRS, two axes, on which a geodetic or projected one rests."""
     from pyproj.crs import GeographicCRS

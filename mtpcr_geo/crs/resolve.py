@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.crs.facts import CrsFacts, facts_of, metric, same_datum, same_heights, same_place, unbound
 from mtpcr_geo.crs.link import FrameLink, WorkFrame, box_points, run_pipeline
-from mtpcr_geo.crs.operation import area_of, best_operation, local_projection
+from mtpcr_geo.crs.operation import area_of, best_operation, grid_scale, local_projection
 from mtpcr_geo.errors import CrsError, InputError
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Vertical = Literal["refuse", "assume-same", "estimate"]
 LOCAL = "local"
+SCALE_NOTED, SCALE_REFUSED = 0.002, 0.01  # departure of a map's metre from a metre on the ground
 FARTHEST_APART = 100_000.0  # metres between the bounds of two clouds that both claim a place on earth
 
 
@@ -91,8 +92,11 @@ def resolve_frames(
     if target_facts.kind == "local" or source_facts.kind == "local":
         source_work = _work_crs(source_facts, source_bounds)
         source_link = _link(source_facts, source_work, source_facts, source_bounds, "assume-same")
+        _note_scale(source_link, source_facts, source_work, beside_local=True)
+        _note_scale(target_link, target_facts, work, beside_local=True)
     else:
         source_link = _link(source_facts, work, target_facts, source_bounds, vertical)
+        _note_scale(target_link, target_facts, work, beside_local=False)
         _require_near(target_link, source_link)
     frame = WorkFrame(None if work is None else unbound(work), target_link.origin)
     if out_crs is not None:
@@ -212,6 +216,31 @@ def _origin(link: FrameLink, bounds: Floats) -> Floats:
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     # the odd fraction keeps bounds on a decimal grid off the rounding edge, where a far shift could flip it
     return np.asarray(np.floor(middle + 0.123456))
+
+
+def _note_scale(link: FrameLink, facts: CrsFacts, work: CRS | None, beside_local: bool) -> None:
+    """Record how true the metres of the work frame are; a local cloud has true ones, which must go with them.
+
+    Raises:
+        CrsError: if a local cloud would have to be stretched.
+
+    """
+    if work is None or facts.kind != "projected" or link.bounds is None:
+        return
+    area = area_of(facts, box_points(link.bounds, 2))
+    scale = None if area is None else grid_scale(unbound(work), area)
+    if scale is None:
+        return
+    link.report["grid_scale"] = list(scale)
+    worst = max(scale, key=lambda one: abs(one - 1.0))
+    said = f"a metre on the ground is {worst:.4f} m in {facts.name} here"
+    if beside_local and abs(worst - 1.0) > SCALE_REFUSED:
+        raise CrsError(
+            f"{said}, and a local cloud has metres of the ground: no rigid transform fits both; "
+            "reproject the other one to a system of true scale, such as its UTM zone"
+        )
+    if abs(worst - 1.0) > SCALE_NOTED:
+        link.report["notes"].append(f"{said}: distances in metres are off by that")
 
 
 def _require_near(target: FrameLink, source: FrameLink) -> None:
