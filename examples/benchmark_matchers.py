@@ -4,9 +4,9 @@
 
 DATA holds a folder for each pair: source.laz, target.laz and pair.json with the true transform. Every start
 turns the source by any yaw and shifts it by up to 100 m; ``--tilt 4`` tilts it too, and has it levelled.
-All matchers see the same starts, at the cells that `register` gives them; `correlation` needs no image. A run is right when
-it ends within 5 degrees and 2 m of the truth (the source's centroid), whatever its verdict. Time is from
-matching to verdict; memory is the process's peak meanwhile, clouds and libraries included.
+All matchers see the same starts, at the cells that `register` gives them; `correlation` needs no image. A
+run is right when it ends within 5 degrees and 2 m of the truth (the source's centroid), whatever its verdict.
+Time is from matching to verdict; memory is the process's peak meanwhile, clouds and libraries included.
 """
 
 from __future__ import annotations

@@ -15,6 +15,9 @@ from mtpcr_geo.match.onnx_models import Graph, Running, as_input
 
 Floats = NDArray[np.float64]
 
+LEAST_EDGE = 128
+"""Edge to which tiny images are padded: fused graphs want room for a fixed number of keypoints."""
+
 
 class LightGlue:
     """A pairing by a graph of the contract: kpts0, kpts1, desc0, desc1 in; matches and scores out.
@@ -108,7 +111,7 @@ class FusedLightGlue:
         scale = min(1.0, self.model.tile / longest)
         shrunk = [_shrunk(image, scale) for image in (source, target)]
         shape = [
-            -(-max(image.shape[axis] for image in shrunk) // self.model.size_multiple)
+            -(-max(LEAST_EDGE, *(image.shape[axis] for image in shrunk)) // self.model.size_multiple)
             * self.model.size_multiple
             for axis in (0, 1)
         ]
