@@ -205,7 +205,15 @@ def test_superpoint_and_lightglue_of_random_weights_run_the_whole_path(town_file
     assert len(match["turns_deg"]) == 8
     # random projections of patches tell places apart: the yaw is found
     assert np.degrees(geometry.yaw_of(result.T_target_source[:3, :3])) == pytest.approx(61.0, abs=0.5)
-    assert (tmp_path / "out" / "audit.rrd").exists()
+    from rerun.chunk import RrdReader
+
+    chunks = RrdReader(str(tmp_path / "out" / "audit.rrd")).stream().to_chunks()
+    assert {
+        "/keypoints/source/image", "/keypoints/source/all", "/keypoints/target/matched", "/sweep/agreeing",
+        "/sweep/matches", "/enhancement/source/before", "/enhancement/target/after",
+    } <= {chunk.entity_path for chunk in chunks}  # fmt: skip
+    # arrays stay out of what is written as JSON
+    assert len(json.dumps(match)) < 2000
 
 
 def test_paper_profile_runs_the_whole_path(town_files, small_models, tmp_path):
@@ -268,6 +276,12 @@ def test_focus_matches_again_where_overlap_is_small():
     assert told["applied"]
     assert told["agreeing_after"] > told["agreeing_before"]
     assert forced.before_focus is first
+    from mtpcr_geo.export.recording_matching import Pen, log_focus
+
+    logged: list[str] = []
+    pen = Pen(lambda path, what: logged.append(path), lambda path, picture: logged.append(path))
+    log_focus(pen, pair.with_(matches=forced))
+    assert logged == ["focus/before/image", "focus/before/lines", "focus/after/image", "focus/after/lines"]
     # still on the pixels of the rasters given
     s = pair.source.bev.grid.to_metres(forced.source_px)
     t = pair.target.bev.grid.to_metres(forced.target_px)

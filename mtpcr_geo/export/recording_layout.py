@@ -40,6 +40,8 @@ def layout(recorded: Recorded) -> Any:
         _overview(recorded),
         _rasters(recorded),
         _matches(recorded),
+        _keypoints(recorded),
+        _focus(recorded),
         _ties(recorded),
         _inputs(recorded),
         _map(recorded),
@@ -121,6 +123,36 @@ def _matches(recorded: Recorded) -> Any:
     return rrb.Vertical(matches, below, row_shares=[3, 1], name="Matches")
 
 
+def _keypoints(recorded: Recorded) -> Any:
+    import rerun.blueprint as rrb
+
+    grids = []
+    for title, paths in (
+        ("Keypoints", [(f"keypoints/{role}", f"{role.capitalize()}: keypoints; matched ones large")
+                       for role in ("source", "target")]),
+        ("Enhancement", [(f"enhancement/{role}/{when}", f"{role.capitalize()} {when} enhancement")
+                         for role in ("source", "target") for when in ("before", "after")]),
+    ):  # fmt: skip
+        views = [view for path, name in paths if (view := _flat(recorded, path, name)) is not None]
+        if views:
+            grids.append(rrb.Grid(*views, grid_columns=2, name=title))
+    if recorded.has("sweep"):
+        charts = [
+            rrb.BarChartView(origin=f"sweep/{what}", name=f"{words} by turn of the source, degrees")
+            for what, words in (("agreeing", "Agreeing matches"), ("matches", "Matches"))
+        ]
+        grids.append(rrb.Vertical(*charts, name="Sweep"))
+    return rrb.Tabs(*grids, name="Keypoints") if grids else None
+
+
+def _focus(recorded: Recorded) -> Any:
+    import rerun.blueprint as rrb
+
+    views = [_flat(recorded, f"focus/{when}", f"Matches {when} FOCUS") for when in ("before", "after")]
+    shown = [view for view in views if view is not None]
+    return rrb.Vertical(*shown, name="FOCUS") if shown else None
+
+
 def _ties(recorded: Recorded) -> Any:
     import rerun.blueprint as rrb
 
@@ -180,7 +212,8 @@ def _flat(recorded: Recorded, origin: str, name: str) -> Any:
     if not recorded.has(origin):
         return None
     bounds = None
-    if origin in recorded.images:
-        width, height = recorded.images[origin]
+    size = recorded.images.get(origin) or recorded.images.get(f"{origin}/image")
+    if size is not None:
+        width, height = size
         bounds = rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height))
     return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds, background=(18, 20, 24))

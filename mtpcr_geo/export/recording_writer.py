@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mtpcr_geo import __version__, draw, geometry
 from mtpcr_geo.cloud.base import Cloud
-from mtpcr_geo.export import story
+from mtpcr_geo.export import recording_matching, story
 from mtpcr_geo.export.recording_layout import TIMELINE, Recorded, layout
 from mtpcr_geo.export.ties import footprints, tie_positions
 from mtpcr_geo.scene import Floats, Pair, Side
@@ -39,6 +39,7 @@ class RecordingWriter:
         self._recorded = Recorded()
         self._seen: dict[str, object] = {}
         self._stage = 0
+        self._pen = recording_matching.Pen(self._log, self._log_image)
         self._stages: list[tuple[str, str, float]] = []
         self._options: dict[str, dict[str, Any]] = {}
         self._properties: dict[str, Any] = {}
@@ -106,8 +107,13 @@ class RecordingWriter:
                 self._log_levelled(side)
             if side.bev is not None and self._new(f"bev {side.role}", side.bev):
                 self._log_bev(side)
+            if self._new(f"appearance {side.role}", side.appearance):
+                recording_matching.log_appearance(self._pen, side)
         if pair.matches is not None and self._new("hypotheses", pair.matches):
             self._log_hypotheses(pair)
+            recording_matching.log_keypoints(self._pen, pair)
+            recording_matching.log_sweep(self._pen, pair)
+            recording_matching.log_focus(self._pen, pair)
         state = (pair.matches, pair.ties, pair.T_target_source is None)
         if pair.matches is not None and self._new("matches", state):
             self._log_matches(pair)

@@ -164,6 +164,8 @@ class Match(Stage):
                 f"{self.label}: {self.options.method} needs one cell size, and the rasters have "
                 f"{source.grid.cell:g} and {target.grid.cell:g} m; set resolution to common in mtpcr.bev"
             )
+        if matcher.needs_image:
+            pair = pair.with_(source=_shown(pair.source), target=_shown(pair.target))
         yaw = None
         if prior is not None and self.options.prior_yaw <= BORNE_TURN_DEG:
             yaw = prior.hypothesis.yaw
@@ -267,17 +269,27 @@ class Focus(Stage):
         return pair.with_(matches=matches)
 
 
+def _shown(side: Side) -> Side:
+    """Give the side with an image of its raster, so that what was matched is on record."""
+    from mtpcr_geo.enhance import image_of
+    from mtpcr_geo.paper import grey
+
+    assert side.bev is not None
+    known = side.appearance
+    if known is not None and known.image.shape == side.bev.grid.shape:
+        return side
+    look = _look_of(side)
+    return replace(side, appearance=Appearance(look, grey(side.bev), image_of(side.bev, look)))
+
+
 def view_of(side: Side, with_image: bool) -> View:
     """Give what a matcher sees of a side: its raster, and its image where one is wanted."""
     from mtpcr_geo.enhance import empty_grey
     from mtpcr_geo.match.base import View
 
     assert side.bev is not None
-    look = _look_of(side)
-    shown = side.appearance
-    if with_image and shown is not None and shown.image.shape == side.bev.grid.shape:
-        return View(side.bev, shown.image, empty_grey(look))
-    return _view(side.bev, look if with_image else None)
+    shown = _shown(side).appearance if with_image else None
+    return View(side.bev) if shown is None else View(side.bev, shown.image, empty_grey(shown.look))
 
 
 def _view(bev: Bev, look: Look | None) -> View:
