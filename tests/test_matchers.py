@@ -345,6 +345,22 @@ def test_paper_profile_and_its_switches_in_the_pipeline():
         build_pipeline("a.laz", "b.laz", "out", read_options({"res": False}))
 
 
+def test_ready_pipeline_of_the_paper_is_that_of_the_profile():
+    from conftest import REPOSITORY
+
+    from mtpcr_geo.pipeline import grammar
+
+    text = (REPOSITORY / "pipelines" / "paper.json").read_bytes()
+    ready = {spec.tag: spec.options for spec in grammar.link(grammar.parse(text))}
+    stages = build_pipeline("a.laz", "b.laz", "out", read_options({"profile": "paper"}))
+    for stage in stages[2:]:
+        if stage["tag"] in ready and stage["type"].startswith("mtpcr.") and "filename" not in stage:
+            own = {key: value for key, value in stage.items() if key not in ("type", "tag", "inputs")}
+            assert {k: v for k, v in own.items() if v} == {
+                k: v for k, v in ready[stage["tag"]].items() if v
+            }, stage["tag"]
+
+
 def test_models_command_lists_files_licences_and_terms(small_models):
     told = CliRunner().invoke(app, ["models", "--models", str(small_models)])
     assert told.exit_code == 0
