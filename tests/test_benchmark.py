@@ -415,8 +415,8 @@ def test_benchmark_leaves_tables_and_plots(data, tmp_path):
     run_benchmark(wanted, ["icp"], tmp_path, starts=2, ranges=NEAR)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {
-        "runs.jsonl", "runs.csv", "protocol.json", "methods.csv", "pairs.csv", "results.json", "tables.md",
-        "cumulative_errors.png", "success_overlap.png", "success_yaw.png",
+        "runs.jsonl", "methods.log", "runs.csv", "protocol.json", "methods.csv", "pairs.csv", "results.json",
+        "tables.md", "cumulative_errors.png", "success_overlap.png", "success_yaw.png",
     }  # fmt: skip
     with (tmp_path / "runs.csv").open() as file:
         lines = list(csv.DictReader(file))

@@ -1,6 +1,6 @@
 """What the verb `benchmark` does: pairs from somewhere, the protocol, and its results as files.
 
-The results' folder holds, besides ``runs.jsonl`` and ``protocol.json`` of the protocol: ``runs.csv`` (a
+The results' folder holds, besides what the protocol leaves (``runs.jsonl``): ``runs.csv`` (a
 line a run), ``methods.csv`` and ``pairs.csv`` (sums), ``results.json`` (the same, with Tables I to IV),
 ``tables.md`` (for reading) and the plots as PNG where matplotlib is installed.
 """

@@ -3,7 +3,8 @@
     runs = run_protocol(pair_folders(data), ["mtpcr-geo", "kiss-matcher:voxel=1"], Path("out"), starts=10)
 
 Results are one JSON line a run in ``runs.jsonl``; what is there is not run again. ``protocol.json``
-beside it says how the starts are drawn: results of two protocols never mix.
+beside it says how the starts are drawn: results of two protocols never mix. What libraries print goes to
+``methods.log``.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from mtpcr_geo.pipeline.stage import Progress
 
 Row = dict[str, Any]
-RUNS, PROTOCOL = "runs.jsonl", "protocol.json"
+RUNS, PROTOCOL, LOG = "runs.jsonl", "protocol.json", "methods.log"
 LOADING_LIMIT_S = 600.0
 FRAME = "metres; origin at the middle of the target's bounds; z up"
 
@@ -92,7 +93,7 @@ def run_protocol(
         for method in methods:
             left = [k for k in range(starts) if (folder.name, method, k) not in there]
             if left:
-                waiting.append(Task(Path(folder), method, tuple(left), ranges, threads))
+                waiting.append(Task(Path(folder), method, tuple(left), ranges, threads, out / LOG))
     count = sum(len(task.starts) for task in waiting)
     bars = progress or NoProgress()
     with _results(path) as file, bars.task("benchmark runs", count) as advance:
@@ -243,7 +244,7 @@ def _ended(one: _Running, give_up: Any) -> None:
     if one.begun is None:
         raise MtpcrError(
             f"the process for {one.task.folder.name} with {one.task.method} ended before its first run "
-            f"(exit code {code})"
+            f"(exit code {code}); see {one.task.log}"
         )
     if one.left:
         give_up(one, f"the process ended with exit code {code}", time.monotonic() - one.said)

@@ -62,6 +62,7 @@ class Task:
         starts: which of the pair's starts.
         ranges: what they are drawn from.
         threads: how many the method's libraries may use.
+        log: file to which goes whatever libraries print; nothing is caught if None.
 
     """
 
@@ -70,6 +71,7 @@ class Task:
     starts: tuple[int, ...]
     ranges: StartRange
     threads: int
+    log: Path | None = None
 
 
 def work(task: Task, parent: Connection) -> None:
@@ -79,6 +81,12 @@ def work(task: Task, parent: Connection) -> None:
     with the whole result; ``("failed", text)`` where nothing can be run; ``("done", None)`` at the end.
     """
     os.environ["OMP_NUM_THREADS"] = str(task.threads)
+    if task.log is not None:
+        # libraries in C++ print past Python's own streams
+        file = os.open(task.log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        for stream in (1, 2):
+            os.dup2(file, stream)
+        os.close(file)
     try:
         pair = load_pair(task.folder)
         method = make_method(task.method)

@@ -64,6 +64,14 @@ def mutual_matches(source: Features, target: Features) -> NDArray[np.int64]:
     return np.asarray(found, np.int64).reshape(-1, 2)
 
 
+def at_most(matches: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:
+    """Draw at most so many of the matches, in their order."""
+    if len(matches) <= most:
+        return matches
+    chosen = np.random.default_rng(seed).choice(len(matches), most, replace=False)
+    return matches[np.sort(chosen)]
+
+
 def best_rigid(source: Floats, target: Floats) -> Floats:
     """Fit a rigid transform to matches by least squares (S. Umeyama, 1991, without scale).
 
@@ -96,7 +104,7 @@ class FpfhMethod(ABC):
         o3d = import_open3d()
         o3d.utility.random.seed(seed)
         s, t = features(source, self.voxel), features(target, self.voxel)
-        answer = self.solve(s, t)
+        answer = self.solve(s, t, seed)
         if answer.T_target_source is None or not self.icp:
             return answer
         kit = o3d.pipelines.registration
@@ -112,14 +120,14 @@ class FpfhMethod(ABC):
         return Estimate(np.array(refined.transformation), answer.verdict, answer.reason, details)
 
     @abstractmethod
-    def solve(self, source: Features, target: Features) -> Estimate:
+    def solve(self, source: Features, target: Features, seed: int) -> Estimate:
         """Find the transform from features."""
 
 
 class FpfhSvd(FpfhMethod):
     """Mutual nearest neighbours of FPFH, and one least-squares fit to all of them."""
 
-    def solve(self, source: Features, target: Features) -> Estimate:
+    def solve(self, source: Features, target: Features, seed: int) -> Estimate:
         """Fit to every match, right or wrong."""
         matches = mutual_matches(source, target)
         if len(matches) < FEWEST_MATCHES:
@@ -141,7 +149,7 @@ class FpfhRansac(FpfhMethod):
         super().__init__(voxel, icp)
         self.iterations = iterations
 
-    def solve(self, source: Features, target: Features) -> Estimate:
+    def solve(self, source: Features, target: Features, seed: int) -> Estimate:
         """Draw matches until the confidence is 0.999."""
         kit = import_open3d().pipelines.registration
         reach = 1.5 * self.voxel
@@ -168,7 +176,7 @@ class FpfhRansac(FpfhMethod):
 class FpfhFgr(FpfhMethod):
     """FPFH and fast global registration: Q.-Y. Zhou, J. Park and V. Koltun (2016)."""
 
-    def solve(self, source: Features, target: Features) -> Estimate:
+    def solve(self, source: Features, target: Features, seed: int) -> Estimate:
         """Minimise a robust cost over all matches at once."""
         kit = import_open3d().pipelines.registration
         found = kit.registration_fgr_based_on_feature_matching(
