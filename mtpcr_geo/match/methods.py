@@ -100,7 +100,7 @@ def make_matcher(name: str, correlation: CorrelationSettings, keypoints: Keypoin
 
 
 def _images(name: str, settings: KeypointSettings) -> tuple[ImageMatcher, int]:
-    """Make what pairs pixels, and give the edge to which it wants small images magnified."""
+    """Make what pairs pixels, and give the edge up to which it wants small images magnified."""
     ratio = RATIO if settings.ratio is None else settings.ratio
     if name in ("rootsift", "orb"):
         most = settings.max_keypoints or 8192

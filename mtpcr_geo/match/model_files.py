@@ -35,7 +35,7 @@ class ExtractorFile(_Part):
     max_keypoints: int = Field(4096, ge=1, description="keypoints kept of an image")
     tile: int = Field(1024, ge=64, description="edge of the tiles that larger images are cut into, pixels")
     magnify_to: int = Field(
-        0, ge=0, description="smaller images are magnified to this edge, at most twice; 0 for never"
+        0, ge=0, description="images are magnified twice where they then stay within this edge; 0 for never"
     )
     channels: Literal[1, 3] = Field(1, description="grey, or grey three times over")
     mean: float = Field(0.0, description="taken from grey / 255 before the graph sees it")
