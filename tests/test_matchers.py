@@ -567,7 +567,9 @@ def test_learned_matchers_on_a_real_pair(name, shared_models, shared_data, tmp_p
         recording=False,
     )
     assert np.degrees(geometry.rotation_angle(result.T_target_source[:3, :3])) < 0.5
-    assert result.verdict.name == "accepted"
+    # ALIKED finds the pose by few ties in one corner: it may be doubted, and says why, but not refused
+    assert result.verdict.name in ("accepted", "doubtful")
+    assert result.verdict.reasons
 
 
 @pytest.mark.slow
