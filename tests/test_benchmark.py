@@ -72,6 +72,8 @@ def test_protocol_runs_judges_and_resumes(data, tmp_path):
         assert row["time_s"] > 0
         assert row["memory_mib"] > 10
     assert {row["group"] for row in rows} == {"A-G", "pairs"}
+    # fewer starts than there are results: all count
+    assert run_protocol(folders, [method], tmp_path, starts=1, ranges=NEAR) == rows
 
 
 def test_interrupted_results_lose_only_the_run_under_way(data, tmp_path):

@@ -61,6 +61,8 @@ def run_protocol(
 ) -> list[Row]:
     """Run what is not in the results yet, and give all rows of these pairs and methods.
 
+    Starts beyond those asked for, from an earlier call, are given too.
+
     Args:
         folders: pairs.
         methods: names with options, see `mtpcr_geo.evaluate.methods`.
@@ -98,8 +100,8 @@ def run_protocol(
     bars = progress or NoProgress()
     with _results(path) as file, bars.task("benchmark runs", count) as advance:
         _drive(waiting, jobs, time_limit_s, file, advance)
-    wanted = {(folder.name, method, k) for folder in folders for method in methods for k in range(starts)}
-    return [row for row in read_rows(path) if _key(row) in wanted]
+    wanted = {(folder.name, method) for folder in folders for method in methods}
+    return [row for row in read_rows(path) if (row["pair"], row["method"]) in wanted]
 
 
 def read_rows(path: Path) -> list[Row]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mtpcr_geo import geometry
 from mtpcr_geo.evaluate.methods import Estimate
-from mtpcr_geo.evaluate.rivals.fpfh import FEWEST_MATCHES, Features, FpfhMethod, at_most, mutual_matches
+from mtpcr_geo.evaluate.rivals.fpfh import Features, Indices, PrunedFpfhMethod
 
 Floats = NDArray[np.float64]
 FEWEST_INLIERS = 5
@@ -49,26 +49,13 @@ class KissMatcher:
         return _answer(matcher, solution)
 
 
-class FpfhGnc(FpfhMethod):
-    """Mutual nearest neighbours of FPFH, pruned and solved in TEASER's style.
+class FpfhGnc(PrunedFpfhMethod):
+    """Mutual nearest neighbours of FPFH, pruned and solved in TEASER's style."""
 
-    Args:
-        voxel, icp: as for all.
-        most: matches at most, as KISS-Matcher has it; the graph of their consistency grows with the square.
-
-    """
-
-    def __init__(self, voxel: float = 1.0, icp: bool = True, most: int = 5000) -> None:
-        super().__init__(voxel, icp)
-        self.most = most
-
-    def solve(self, source: Features, target: Features, seed: int) -> Estimate:
+    def solve(self, source: Features, target: Features, matches: Indices, seed: int) -> Estimate:
         """Prune the matches by their consistency, and solve for what is left."""
         import kiss_matcher
 
-        matches = at_most(mutual_matches(source, target), self.most, seed)
-        if len(matches) < FEWEST_MATCHES:
-            return Estimate(None, "refused", f"only {len(matches)} matches")
         matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(self.voxel))
         solution = matcher.prune_and_solve(
             list(source.xyz[matches[:, 0]].astype(np.float32)),

@@ -9,29 +9,16 @@ import numpy as np
 
 from mtpcr_geo import geometry
 from mtpcr_geo.evaluate.methods import Estimate
-from mtpcr_geo.evaluate.rivals.fpfh import FEWEST_MATCHES, Features, FpfhMethod, at_most, mutual_matches
+from mtpcr_geo.evaluate.rivals.fpfh import Features, Indices, PrunedFpfhMethod
 
 
-class FpfhTeaser(FpfhMethod):
-    """Mutual nearest neighbours of FPFH, and TEASER++ without scale.
+class FpfhTeaser(PrunedFpfhMethod):
+    """Mutual nearest neighbours of FPFH, and TEASER++ without scale."""
 
-    Args:
-        voxel, icp: as for all.
-        most: matches at most, as KISS-Matcher has it; the graph of their consistency grows with the square.
-
-    """
-
-    def __init__(self, voxel: float = 1.0, icp: bool = True, most: int = 5000) -> None:
-        super().__init__(voxel, icp)
-        self.most = most
-
-    def solve(self, source: Features, target: Features, seed: int) -> Estimate:
+    def solve(self, source: Features, target: Features, matches: Indices, seed: int) -> Estimate:
         """Solve with a noise bound of one voxel, as its authors' example does."""
         import teaserpp_python
 
-        matches = at_most(mutual_matches(source, target), self.most, seed)
-        if len(matches) < FEWEST_MATCHES:
-            return Estimate(None, "refused", f"only {len(matches)} matches")
         params = teaserpp_python.RobustRegistrationSolver.Params()
         params.cbar2 = 1.0
         params.noise_bound = self.voxel
