@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from mtpcr_geo.match.keypoints import magnified, margin_of, turn_image
 from mtpcr_geo.match.lightglue import LightGlue, normalised
 from mtpcr_geo.match.methods import KeypointSettings, make_matcher
 from mtpcr_geo.match.model_files import ExtractorFile, MatcherFile, descriptions
-from mtpcr_geo.match.onnx_models import OnnxExtractor, Running, tiles
+from mtpcr_geo.match.onnx_models import OnnxExtractor, Running, filled, tiles
 from mtpcr_geo.raster import Grid
 from mtpcr_geo.register import build_pipeline, read_options, register
 from mtpcr_geo.scene import Bev, Hypothesis
@@ -156,6 +157,26 @@ def test_tiles_cover_every_pixel_once(shape):
         assert east <= min(column + 512, shape[1])
         assert south <= min(row + 512, shape[0])
     assert (seen == 1).all()
+
+
+def test_filled_keeps_a_margin_and_stays_inside():
+    image = np.full((60, 90), 127, np.uint8)
+    image[20:25, 3:10] = 200
+    assert filled(image, 127, 8) == (12, 0, 33, 18)
+    assert filled(image, 127, 0) == (20, 3, 25, 10)
+    assert filled(image, 0, 8) == (0, 0, 60, 90)
+
+
+def test_orientations_are_compared_by_few_keypoints_and_matched_by_all():
+    source, target = quarter_turned()
+    whole = matcher("rootsift")
+    images = replace(whole.images, any_yaw=False)
+    every = replace(whole, images=images).match(source, target)
+    quick = replace(whole, images=images, sweep_keypoints=100).match(source, target)
+    assert quick.report["turn_deg"] == every.report["turn_deg"]
+    assert max(quick.report["turn_matches"]) <= 100 < len(quick.score)
+    np.testing.assert_array_equal(quick.source_px, every.source_px)
+    np.testing.assert_array_equal(quick.target_px, every.target_px)
 
 
 def test_lightglue_normalises_by_the_longer_edge():

@@ -56,8 +56,8 @@ class Features:
     def __len__(self) -> int:
         return len(self.score)
 
-    def take(self, chosen: NDArray[Any]) -> Features:
-        """Keep some, by mask or by index."""
+    def take(self, chosen: NDArray[Any] | slice) -> Features:
+        """Keep some, by mask, index or slice."""
         return Features(self.px[chosen], self.score[chosen], self.descriptors[chosen])
 
 
@@ -108,8 +108,8 @@ class ImageMatcher(Protocol):
 
         """
 
-    def match(self, source: Any, target: Any) -> PixelMatches:
-        """Match two prepared images."""
+    def match(self, source: Any, target: Any, most: int | None = None) -> PixelMatches:
+        """Match two prepared images, by at most so many keypoints of each where that saves time."""
 
 
 class Matcher(Protocol):

@@ -137,10 +137,14 @@ class FeatureMatcher:
         return self.extractor.extract(image, empty), (image.shape[0], image.shape[1])
 
     def match(
-        self, source: tuple[Features, tuple[int, int]], target: tuple[Features, tuple[int, int]]
+        self,
+        source: tuple[Features, tuple[int, int]],
+        target: tuple[Features, tuple[int, int]],
+        most: int | None = None,
     ) -> PixelMatches:
-        """Pair the features of two images."""
+        """Pair the features of two images, or the best of each."""
         (s, shape_s), (t, shape_t) = source, target
+        s, t = s.take(slice(most)), t.take(slice(most))
         # as if both were padded to one size, so that places are scaled alike
         shape = max(shape_s[0], shape_t[0]), max(shape_s[1], shape_t[1])
         index, score = self.pairing.pair(s, t, (shape, shape))

@@ -67,6 +67,8 @@ class KeypointMatcher:
         turns: orientations tried, evenly round the circle, where the image matcher needs it.
         magnify_to: images are magnified twice where they then stay within this edge, pixels; 0 for never.
         tolerance_m: plan distance within which matches agree, metres; 1.5 of the larger cells if None.
+        sweep_keypoints: keypoints that orientations are compared by; the best is matched with all. None for
+            all at once.
 
     """
 
@@ -75,6 +77,7 @@ class KeypointMatcher:
     turns: int = 8
     tolerance_m: float | None = None
     magnify_to: int = 0
+    sweep_keypoints: int | None = None
     needs_image: bool = field(default=True, init=False)
     needs_one_cell: bool = field(default=False, init=False)
 
@@ -99,12 +102,21 @@ class KeypointMatcher:
         zoom = ZOOM if ZOOM * longest <= self.magnify_to else 1.0
         prepared = self.images.prepare(magnified(target.image, zoom), target.empty)
         tolerance = self.tolerance_m or AGREE_CELLS * max(source.grid.cell, target.grid.cell)
-        tried = []
-        for turn in self._sweep(yaw):
-            found = self._match_turned(magnified(source.image, zoom), source.empty, prepared, turn, zoom)
+        image = magnified(source.image, zoom)
+        turns = self._sweep(yaw)
+        few = self.sweep_keypoints if len(turns) > 1 else None
+        tried, turned = [], []
+        for turn in turns:
+            one = _Turned.of(image, source.empty, turn, self.images)
+            found = one.match(self.images, prepared, zoom, few)
             tried.append(_judge(turn, found, source.grid, target.grid, tolerance, seed))
+            turned.append(one)
             advance(1)
-        best = max(tried, key=lambda o: (o.count, float(o.found.score.sum())))
+        chosen = max(range(len(tried)), key=lambda k: (tried[k].count, float(tried[k].found.score.sum())))
+        best = tried[chosen]
+        if few is not None:
+            found = turned[chosen].match(self.images, prepared, zoom)
+            best = _judge(best.turn, found, source.grid, target.grid, tolerance, seed)
         if not len(best.found):
             seen = max(len(o.found.source_keypoints) for o in tried), len(best.found.target_keypoints)
             raise RegistrationError(
@@ -142,19 +154,32 @@ class KeypointMatcher:
             return [yaw]
         return [2 * np.pi * k / self.turns for k in range(self.turns)]
 
-    def _match_turned(self, image: Grey, empty: int, target: Any, turn: float, zoom: float) -> PixelMatches:
+
+@dataclass(frozen=True)
+class _Turned:
+    """The source's image in one orientation, prepared, and the affine map back to the image itself."""
+
+    prepared: Any
+    back: Floats
+
+    @classmethod
+    def of(cls, image: Grey, empty: int, turn: float, images: ImageMatcher) -> _Turned:
         turned, back = turn_image(image, turn, empty)
-        found = self.images.match(self.images.prepare(turned, empty), target)
+        return cls(images.prepare(turned, empty), back)
+
+    def match(self, images: ImageMatcher, target: Any, zoom: float, most: int | None = None) -> PixelMatches:
+        """Match to a prepared target, in pixels of the images before magnifying and turning."""
+        found = images.match(self.prepared, target, most)
 
         def shrunk(px: Floats) -> Floats:
             return np.asarray((px + 0.5) / zoom - 0.5)
 
         return one_to_one(
             PixelMatches(
-                shrunk(_affine(back, found.source_px)),
+                shrunk(_affine(self.back, found.source_px)),
                 shrunk(found.target_px),
                 np.clip(found.score, 0.0, 1.0),
-                shrunk(_affine(back, found.source_keypoints)),
+                shrunk(_affine(self.back, found.source_keypoints)),
                 shrunk(found.target_keypoints),
             )
         )

@@ -96,8 +96,10 @@ class FusedLightGlue:
         """Nothing can be done for one image alone."""
         return image, empty
 
-    def match(self, first: tuple[Grey, int], second: tuple[Grey, int]) -> PixelMatches:
-        """Match two prepared images.
+    def match(
+        self, first: tuple[Grey, int], second: tuple[Grey, int], most: int | None = None
+    ) -> PixelMatches:
+        """Match two prepared images; how many keypoints is in the graph.
 
         Raises:
             InputError: if the graph gives something else than the contract says.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from mtpcr_geo.errors import OptionError
 from mtpcr_geo.match.base import Advance, ImageMatcher, Matcher, View
@@ -95,26 +95,30 @@ def make_matcher(name: str, correlation: CorrelationSettings, keypoints: Keypoin
     """
     if name == "correlation":
         return CorrelationMatcher(correlation)
-    images, magnify_to = _images(name, keypoints)
-    return KeypointMatcher(name, images, keypoints.turns, keypoints.tolerance_m, magnify_to)
-
-
-def _images(name: str, settings: KeypointSettings) -> tuple[ImageMatcher, int]:
-    """Make what pairs pixels, and give the edge up to which it wants small images magnified."""
-    ratio = RATIO if settings.ratio is None else settings.ratio
+    shared: dict[str, Any] = {"turns": keypoints.turns, "tolerance_m": keypoints.tolerance_m}
     if name in ("rootsift", "orb"):
-        most = settings.max_keypoints or 8192
-        extractor: Extractor = RootSift(most) if name == "rootsift" else Orb(most)
-        nearest = NearestNeighbours(ratio, bool(settings.cross_check))
-        return FeatureMatcher(extractor, nearest, any_yaw=True), 0
-    folder = models_folder(settings.models)
+        return KeypointMatcher(name, _classical(name, keypoints), **shared)
+    folder = models_folder(keypoints.models)
     known = descriptions(folder)
     if name not in known:
         from mtpcr_geo.pipeline.words import meant
 
         raise OptionError(f"there is no matcher {name!r}{meant(name, [*BUILT_IN, *known])}")
     model = known[name]
-    return _learned(model, folder, settings), model.extractor.magnify_to if model.extractor else 0
+    return KeypointMatcher(
+        name,
+        _learned(model, folder, keypoints),
+        **shared,
+        magnify_to=model.extractor.magnify_to if model.extractor else 0,
+        sweep_keypoints=model.matcher.sweep_keypoints if model.matcher else None,
+    )
+
+
+def _classical(name: str, settings: KeypointSettings) -> ImageMatcher:
+    most = settings.max_keypoints or 8192
+    extractor: Extractor = RootSift(most) if name == "rootsift" else Orb(most)
+    ratio = RATIO if settings.ratio is None else settings.ratio
+    return FeatureMatcher(extractor, NearestNeighbours(ratio, bool(settings.cross_check)), any_yaw=True)
 
 
 def _learned(model: ModelDescription, folder: Path | None, settings: KeypointSettings) -> ImageMatcher:

@@ -51,6 +51,12 @@ class MatcherFile(_Part):
 
     file: str = Field(description="ONNX file in the models folder")
     score_threshold: float = Field(0.1, description="pairs that score no more are dropped")
+    sweep_keypoints: int = Field(
+        2048,
+        ge=16,
+        description="orientations are compared by so many of the best keypoints; attention takes time by "
+        "their square. The best orientation is matched with all",
+    )
     names: dict[str, str] = Field(
         {}, description="the graph's own names where they differ: kpts0, kpts1, desc0, desc1, matches, scores"
     )

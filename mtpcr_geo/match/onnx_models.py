@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -63,7 +64,7 @@ class Graph:
         self.path = path
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 3
-        options.intra_op_num_threads = running.threads
+        options.intra_op_num_threads = running.threads or _threads_allowed()
         # tiles of one shape come one after another; an arena would keep the largest of everything
         options.enable_cpu_mem_arena = False
         providers = _providers(onnxruntime.get_available_providers(), running.device)
@@ -157,6 +158,12 @@ class OnnxExtractor:
         self, image: Grey, empty: int, column: int, row: int, core: tuple[int, int, int, int]
     ) -> Features:
         part = image[row : row + self.tile, column : column + self.tile]
+        if np.ptp(part) == 0:
+            return self._none()
+        # networks take time by area, and turned images have empty corners
+        top, left, bottom, right = filled(part, empty, OVERLAP_PX // 2)
+        part = part[top:bottom, left:right]
+        column, row = column + left, row + top
         height, width = part.shape
         padded = np.full(
             (_multiple(height, self.model.size_multiple), _multiple(width, self.model.size_multiple)),
@@ -164,8 +171,6 @@ class OnnxExtractor:
             np.uint8,
         )
         padded[:height, :width] = part
-        if np.ptp(part) == 0:
-            return self._none()
         wanted = min(self.max_keypoints, padded.size)
         px, score, descriptors = self.graph.run(
             image=as_input(padded, self.model.channels, self.model.mean, self.model.std),
@@ -194,6 +199,36 @@ class OnnxExtractor:
     def _none(self) -> Features:
         dim = self.model.descriptor_dim
         return Features(np.empty((0, 2)), np.empty(0, np.float32), np.empty((0, dim), np.float32))
+
+
+def _threads_allowed() -> int:
+    """Give onnxruntime's number of threads: its own choice, or fewer where the process may use fewer cores.
+
+    It counts the machine's cores; more threads than it may use spin in each other's way.
+    """
+    if not hasattr(os, "sched_getaffinity"):
+        return 0
+    allowed = len(os.sched_getaffinity(0))
+    return allowed if allowed < (os.cpu_count() or 1) else 0
+
+
+def filled(image: Grey, empty: int, margin: int) -> tuple[int, int, int, int]:
+    """Give the (top, left, bottom, right) of what is not empty, with a margin; bottom and right excluded.
+
+    Args:
+        image: (h, w) uint8, not all of it empty.
+        empty: grey value of empty cells.
+        margin: pixels of emptiness kept around, where there are so many.
+
+    """
+    there = image != empty
+    rows, columns = (np.flatnonzero(there.any(axis=axis)) for axis in (1, 0))
+    return (
+        max(int(rows[0]) - margin, 0),
+        max(int(columns[0]) - margin, 0),
+        min(int(rows[-1]) + 1 + margin, image.shape[0]),
+        min(int(columns[-1]) + 1 + margin, image.shape[1]),
+    )
 
 
 def tiles(
