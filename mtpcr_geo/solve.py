@@ -154,6 +154,7 @@ def iterative_svd(
     weight: Floats | None = None,
     factor: float = 2.5,
     floor: float = 0.5,
+    ceiling: float = np.inf,
     max_iterations: int = 30,
     upright: bool = False,
 ) -> Solution:
@@ -166,6 +167,8 @@ def iterative_svd(
         factor: residuals beyond this many times 1.4826 median residuals are outliers.
         floor: the threshold never falls below this, metres: below the raster's own precision a residual
             says nothing.
+        ceiling: nor does it rise above this, metres: from few ties that agree badly it would grow until it
+            takes in all.
         max_iterations: rounds at most.
         upright: solve yaw and shift only.
 
@@ -177,7 +180,8 @@ def iterative_svd(
     for rounds in range(1, max_iterations + 1):  # noqa: B007 - reported below
         T = fit(source[inlier], target[inlier], None if weight is None else weight[inlier])
         residual = np.linalg.norm(geometry.apply(T, source) - target, axis=1)
-        threshold = max(floor, factor * 1.4826 * float(np.median(residual[inlier])))
+        spread = 1.4826 * float(np.median(residual[inlier]))
+        threshold = min(max(floor, factor * spread), ceiling)
         now = residual < threshold
         if now.sum() < least or (now == inlier).all():
             break
@@ -232,18 +236,20 @@ def solve_ties(
             raise RegistrationError(
                 f"of {len(used)} ties no {least} agree on one yaw and shift; the clouds may not overlap"
             )
+    # the start says to what distance ties agree; as in the paper there is no such bound
+    ceiling = 2.0 * tolerance if robust_start else np.inf
     weight = np.maximum(score[used], 0.05) ** 2
     flat = np.array([1.0, 1.0, 0.0])
     if upright:
         # heights of single ties are rough, so they have no say in plan and are settled by their median
         solution = iterative_svd(
-            s * flat, t * flat, start=start, weight=weight, floor=tolerance, upright=True
+            s * flat, t * flat, start=start, weight=weight, floor=tolerance, ceiling=ceiling, upright=True
         )
         moved = geometry.apply(solution.T, s)
         rise = float(np.median((t - moved)[solution.inlier, 2]))
         T = geometry.translation((0.0, 0.0, rise)) @ solution.T
         solution = replace(solution, T=T)
     else:
-        solution = iterative_svd(s, t, start=start, weight=weight, floor=tolerance)
+        solution = iterative_svd(s, t, start=start, weight=weight, floor=tolerance, ceiling=ceiling)
     plan = np.hypot(*(geometry.apply(solution.T, source) - target)[:, :2].T)
     return solution, plan < max(tolerance, solution.threshold)

@@ -79,6 +79,18 @@ def test_solve_keeps_withheld_ties_out_and_finds_the_transform() -> None:
     assert np.linalg.norm(a.T[:3, 3] - T[:3, 3]) < 0.5
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_few_agreeing_ties_do_not_take_in_the_rest(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    source = rng.uniform(-150, 150, (200, 3)) * [1, 1, 0.02]
+    # no rigid transform fits a shrunk scene but near one place; a threshold that grows with what it lets in
+    # ends at 40 m and calls all of it agreement
+    target = source * [0.9, 0.9, 1.0] + rng.normal(0, 3, (200, 3))
+    solution, agreeing = solve_ties(source, target, np.ones(200), np.zeros(200, bool), tolerance=3.0)
+    assert solution.threshold <= 6.0
+    assert agreeing.sum() < 50
+
+
 def test_ties_that_do_not_agree_are_refused() -> None:
     rng = np.random.default_rng(5)
     with pytest.raises(RegistrationError, match="at least 3"):
