@@ -28,9 +28,10 @@ from mtpcr_geo.evaluate.pairs import load_pair, pair_folders
 from mtpcr_geo.evaluate.steps import follow, level_pair, random_start, steps_of
 
 FIELDS = (
-    "pair", "start", "matcher", "image", "verdict", "right", "rotation_deg", "distance_m", "matches",
-    "agreeing", "time_s", "match_s", "memory_mib", "why",
+    "pair", "seed", "tilt_deg", "start", "matcher", "image", "verdict", "right", "rotation_deg", "distance_m",
+    "matches", "agreeing", "time_s", "match_s", "memory_mib", "why",
 )  # fmt: skip
+KEY = ("pair", "seed", "tilt_deg", "start", "matcher", "image")
 
 
 def main() -> None:
@@ -42,30 +43,67 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=10, help="random starts of each pair")
     parser.add_argument("--seed", type=int, default=0, help="seed of the starts")
     parser.add_argument("--tilt", type=float, default=0.0, help="largest tilt of a start, degrees")
-    parser.add_argument("--matchers", nargs="+", default=["correlation", "rootsift", "xfeat", "aliked"])
+    parser.add_argument(
+        "--matchers",
+        nargs="+",
+        default=["correlation", "rootsift", "xfeat", "aliked"],
+        help="matchers, or a matcher with one image, such as aliked:band_pass",
+    )
     parser.add_argument("--images", nargs="+", default=["band_pass", "paper"], help="looks of mtpcr.enhance")
     parser.add_argument("--models", type=Path, help="folder of model files")
     parser.add_argument("--only", nargs="*", default=[], help="pairs whose name contains one of these")
     parser.add_argument("--unrelated", action="store_true", help="each source against the other targets")
-    parser.add_argument("--csv", type=Path, help="write one row a run")
+    parser.add_argument("--csv", type=Path, help="one row a run; runs that it holds already are not repeated")
     options = parser.parse_args()
+    done = read_rows(options.csv) if options.csv and options.csv.exists() else {}
     rows = []
     try:
-        for row in runs(options):
+        for row in runs(options, done):
             rows.append(row)
-            print(line_of(row), file=sys.stderr, flush=True)
+            if key_of(row) not in done:
+                print(line_of(row), file=sys.stderr, flush=True)
+                append(options.csv, row)
     except MtpcrError as error:
         sys.exit(str(error))
-    if options.csv:
-        with options.csv.open("w", newline="") as file:
-            writer = csv.DictWriter(file, FIELDS)
-            writer.writeheader()
-            writer.writerows(rows)
     print(table(rows))
 
 
-def runs(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Run every matcher from every start of every pair."""
+def key_of(row: dict[str, Any]) -> tuple[str, ...]:
+    """Give what tells one run from another."""
+    return tuple(str(row[name]) for name in KEY)
+
+
+def read_rows(path: Path) -> dict[tuple[str, ...], dict[str, Any]]:
+    """Read the rows of an earlier call, numbers as numbers."""
+
+    def value(name: str, text: str) -> Any:
+        if name in ("pair", "matcher", "image", "verdict", "why"):
+            return text
+        if name == "right":
+            return text == "True"
+        return int(text) if name in ("seed", "start", "matches", "agreeing") else float(text)
+
+    with path.open(newline="") as file:
+        rows = [{k: value(k, text) for k, text in row.items() if text != ""} for row in csv.DictReader(file)]
+    return {key_of(row): row for row in rows}
+
+
+def append(path: Path | None, row: dict[str, Any]) -> None:
+    """Add a row to the file of results, at once: long benchmarks get interrupted."""
+    if path is None:
+        return
+    new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, FIELDS)
+        if new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def runs(
+    options: argparse.Namespace, done: dict[tuple[str, ...], dict[str, Any]]
+) -> Iterator[dict[str, Any]]:
+    """Run every matcher from every start of every pair, but for what is done already."""
     folders = [f for data in options.data for f in pair_folders(data, tuple(options.only))]
     pairs = [load_pair(folder) for folder in folders]
     for k, pair in enumerate(pairs):
@@ -76,24 +114,32 @@ def runs(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
             name = pair.name if other is pair else f"{pair.name[:15]} / {other.name[:15]}"
             centroid = pair.source.mean(axis=0)
             T_moved = random_start(rng, centroid, tilt_deg=options.tilt)
+            run = (name, str(options.seed), str(options.tilt), str(start))
+            keys = [(*run, *variant) for variant in variants(options)]
+            yield from (done[key] for key in keys if key in done)
+            left = [variant for key, variant in zip(keys, variants(options), strict=True) if key not in done]
+            if not left:
+                continue
             moved = geometry.apply(T_moved, pair.source)
             levelled = level_pair(moved, other.target, "auto" if options.tilt else "none")
             rasters: dict[str, Any] = {}
-            for matcher, look in variants(options):
+            for matcher, look in left:
                 raster, *steps = steps_of(matcher=matcher, models=options.models)
                 if str(raster) not in rasters:
                     rasters[str(raster)] = follow(levelled, [raster]).pair
                 if look != "-":
                     steps = [{"type": "mtpcr.enhance", "tag": "enhance", "look": look}, *steps]
-                done = follow(rasters[str(raster)], steps)
-                T = done.pair.T_file if done.pair.T_target_source is not None else None
+                outcome = follow(rasters[str(raster)], steps)
+                T = outcome.pair.T_file if outcome.pair.T_target_source is not None else None
                 row = {
-                    "pair": name, "start": start, "matcher": matcher, "image": look, "verdict": done.verdict,
-                    "matches": len(done.pair.matches.score) if done.pair.matches else 0,
-                    "agreeing": int(done.pair.ties.inlier.sum()) if T is not None else 0,
-                    "time_s": sum(done.seconds.values()), "match_s": done.seconds.get("mtpcr.match"),
-                    "memory_mib": done.memory_mib, "right": False,
-                    "why": done.failure or "; ".join(done.pair.verdict.reasons),
+                    "pair": name, "seed": options.seed, "tilt_deg": options.tilt, "start": start,
+                    "matcher": matcher, "image": look,
+                    "verdict": outcome.verdict,
+                    "matches": len(outcome.pair.matches.score) if outcome.pair.matches else 0,
+                    "agreeing": int(outcome.pair.ties.inlier.sum()) if T is not None else 0,
+                    "time_s": sum(outcome.seconds.values()), "match_s": outcome.seconds.get("mtpcr.match"),
+                    "memory_mib": outcome.memory_mib, "right": False,
+                    "why": outcome.failure or "; ".join(outcome.pair.verdict.reasons),
                 }  # fmt: skip
                 if T is not None and other is pair:
                     T_true = geometry.inverse(T_moved)
@@ -108,11 +154,12 @@ def runs(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 def variants(options: argparse.Namespace) -> list[tuple[str, str]]:
     """List the matchers with the images they see."""
-    return [
-        (matcher, look)
-        for matcher in options.matchers
-        for look in (["-"] if matcher == "correlation" else options.images)
-    ]
+    found = []
+    for matcher in options.matchers:
+        name, _, look = matcher.partition(":")
+        looks = ["-"] if name == "correlation" else [look] if look else options.images
+        found += [(name, one) for one in looks]
+    return found
 
 
 def line_of(row: dict[str, Any]) -> str:
