@@ -121,7 +121,7 @@ class PdalCloud(Cloud):
         size = 0
         with _blamed(self._steps):
             iterator = pipeline.iterator(chunk_size=CHUNK_POINTS, prefetch=1)
-            for records in iterator:
+            for records in pdal_library.arrays_of(iterator):
                 self._note(records)
                 size += records.nbytes
                 if kept is not None and size <= _KEEP_BYTES:
@@ -157,7 +157,8 @@ class PdalCloud(Cloud):
 
     def _stream(self, words: Sequence[Mapping[str, Any]], size: int) -> Iterator[Records]:
         with _blamed(self._steps):
-            yield from pdal_library.pipeline(words).iterator(chunk_size=size, prefetch=1)
+            iterator = pdal_library.pipeline(words).iterator(chunk_size=size, prefetch=1)
+            yield from pdal_library.arrays_of(iterator)
 
     def _probed_crs(self) -> CRS | None:
         """Ask for the CRS by a run over one point of each reader."""

@@ -8,10 +8,14 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import json
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mtpcr_geo.errors import MissingPartError
 
@@ -24,6 +28,7 @@ INSTALL = (
 _STOP_DIMENSION = "MtpcrStopHere"
 _STOP = {"type": "filters.range", "limits": f"{_STOP_DIMENSION}[0:1]", "tag": "mtpcr_stop_here"}
 _ERRORS = (RuntimeError, ValueError, TypeError)
+_SETTLE_S = 0.01
 
 
 @dataclass(frozen=True)
@@ -89,6 +94,19 @@ def load() -> Any:
 def pipeline(stages: Sequence[Mapping[str, Any]]) -> Any:
     """Make a `pdal.Pipeline` of stages, without running it."""
     return load().Pipeline(json.dumps(list(stages)))
+
+
+def arrays_of(iterator: Any) -> Iterator[NDArray[np.void]]:
+    """Yield the arrays of python-pdal's streaming iterator, without being caught in its end.
+
+    Its worker thread marks the end (``PythonPointTable::done``, up to 3.5.5 at least) without the lock that
+    its consumer looks under: who looks just then misses the mark and waits for ever, some once in a
+    thousand streams. After its last array the worker needs a fraction of a millisecond; so each array is
+    followed by a pause long enough for the mark to be there, and short beside reading a full array.
+    """
+    for records in iterator:
+        yield records
+        time.sleep(_SETTLE_S)
 
 
 def problem_of(stages: Sequence[Mapping[str, Any]]) -> str | None:
