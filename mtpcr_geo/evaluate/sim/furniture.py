@@ -1,7 +1,8 @@
-"""What else stands about: cars, poles with wires, garden walls and fences."""
+"""What else stands about or goes by: cars, people, poles with wires, garden walls and fences."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -29,6 +30,21 @@ def add_car(out: MeshBuilder, frame: Frame, rng: np.random.Generator) -> None:
     sides = np.stack([np.stack([a[i], a[(i + 1) % 4], b[(i + 1) % 4], b[i]]) for i in range(4)])
     out.polygons(frame.place(sides), Material.GLASS)
     out.polygons(frame.place(b[None]), Material.METAL)
+
+
+def add_walker(out: MeshBuilder, way: Floats, z: Floats, rng: np.random.Generator) -> None:
+    """Add one who walks by: the same body again and again along a (k, 2) way with ground heights `z` (k,)."""
+    tall, broad = rng.uniform(1.1, 1.9), rng.uniform(0.2, 0.27)
+    for (x, y), g in zip(way, z, strict=True):
+        frame = Frame(float(x), float(y), float(g), float(rng.uniform(0, np.pi)))
+        out.box(frame, (-broad, -0.14, 0.0), (broad, 0.14, tall), Material.PASSING)
+
+
+def add_traffic(out: MeshBuilder, frames: Sequence[Frame], rng: np.random.Generator) -> None:
+    """Add a car that drives by: its outline at each of the places it is met at."""
+    x, y, top = rng.uniform(1.9, 2.4), rng.uniform(0.8, 0.95), rng.uniform(1.4, 1.9)
+    for frame in frames:
+        out.box(frame, (-x, -y, 0.3), (x, y, top), Material.PASSING)
 
 
 def add_wall(out: MeshBuilder, line: Floats, z: Floats, height: float, thick: float = 0.2) -> None:

@@ -12,6 +12,9 @@ from mtpcr_geo.evaluate.sim.raycast import Caster
 
 Floats = NDArray[np.float64]
 Table = dict[str, NDArray[np.generic]]
+# share of the time for which one who passes by is at any one place of the way
+PRESENCE = 0.12
+MOST_PASSED = 20
 
 
 @dataclass(frozen=True)
@@ -82,8 +85,8 @@ def measure(caster: Caster, beams: Beams, how: Instrument, rng: np.random.Genera
     """Send beams out and note what comes back.
 
     A beam that meets a leaf or a wire is only partly stopped: it goes on behind with a chance, up to
-    the instrument's number of returns. Weak returns (far, dark, grazing) are lost; panes of glass and
-    windows in facades mostly lose theirs.
+    the instrument's number of returns. One who walks or drives by is met only at times. Weak returns (far,
+    dark, grazing) are lost; panes of glass and windows in facades mostly lose theirs.
 
     Args:
         caster: the site.
@@ -98,7 +101,8 @@ def measure(caster: Caster, beams: Beams, how: Instrument, rng: np.random.Genera
     alive = np.arange(n)
     gone = np.zeros(n)
     found: list[tuple[NDArray[np.int64], Floats, Floats, NDArray[np.uint8]]] = []
-    for _ in range(how.returns + 1):
+    tries = np.full(n, how.returns + 1)
+    for _ in range(how.returns + 1 + MOST_PASSED):
         start = beams.origin[alive] + gone[alive, None] * direction[alive]
         hits = caster.cast(start, direction[alive])
         ok = np.isfinite(hits.distance)
@@ -110,9 +114,10 @@ def measure(caster: Caster, beams: Beams, how: Instrument, rng: np.random.Genera
             beams.origin[alive] + gone[alive, None] * direction[alive], hits.normal[ok], material, rng
         )
         found.append((alive[seen], gone[alive[seen]].copy(), facing[seen], material[seen]))
-        thin = np.isin(material, (Material.LEAF, Material.WIRE))
+        thin = np.isin(material, (Material.LEAF, Material.WIRE, Material.PASSING))
+        tries[alive] -= material != Material.PASSING
         onward = np.where(seen, 0.45 if how.returns > 1 else 0.0, 1.0)
-        on = thin & (rng.random(len(alive)) < onward)
+        on = thin & (rng.random(len(alive)) < onward) & (tries[alive] > 0)
         alive = alive[on]
         gone[alive] += 0.05 + 0.5 * rng.random(len(alive))
         if not len(alive):
@@ -126,6 +131,7 @@ def _returned(
     strength = REFLECTANCE[material] / 0.5 * np.where(material == Material.LEAF, 0.8, np.sqrt(facing))
     limit = how.reach_m * np.sqrt(strength)
     chance = (1 - how.drop_out) / (1 + np.exp(np.clip((distance - limit) / (0.08 * limit), -50, 50)))
+    chance *= np.where(material == Material.PASSING, PRESENCE, 1.0)
     return np.asarray((distance > how.closest_m) & (rng.random(len(distance)) < chance))
 
 

@@ -26,7 +26,7 @@ class SiteStyle:
         wooded: share of the open land under wood.
         lone_per_ha: single trees per hectare of open land.
         street_trees: share of roads lined with trees.
-        cars_per_100m: parked cars per 100 m of road.
+        cars_per_100m: parked cars per 100 m of road; a quarter as many drive, half as many people walk.
         poles: share of roads with poles; half of those carry wires.
         fields: whether open land is farmed, with crops that differ between the epochs.
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mtpcr_geo.evaluate.sim.buildings import Building, RoofForm, add_building
 from mtpcr_geo.evaluate.sim.furniture import add_wall
 from mtpcr_geo.evaluate.sim.kinds import SiteStyle
-from mtpcr_geo.evaluate.sim.mesh import Frame, MeshBuilder
+from mtpcr_geo.evaluate.sim.mesh import Frame, Mesh, MeshBuilder
 from mtpcr_geo.evaluate.sim.roads import Network
 from mtpcr_geo.evaluate.sim.terrain import Ground
 from mtpcr_geo.evaluate.sim.vegetation import Plants, Species, add_hedge
@@ -63,7 +63,8 @@ class Layout:
     Attributes:
         ground: the land.
         occupancy: what is taken.
-        fixed: geometry that is the same in all epochs.
+        fixed: geometry that is the same in all epochs, but for buildings.
+        buildings: one mesh each.
         hedges: (k, 2) lines in metres with their heights.
         plants: gardens' trees: x, y, height, species.
         yards: courts yet to be filled: the house's frame, width, depth and eaves height.
@@ -73,6 +74,7 @@ class Layout:
     ground: Ground
     occupancy: Occupancy
     fixed: MeshBuilder = field(default_factory=MeshBuilder)
+    buildings: list[Mesh] = field(default_factory=list)
     hedges: list[tuple[Floats, float]] = field(default_factory=list)
     plants: list[tuple[float, float, float, int]] = field(default_factory=list)
     yards: list[tuple[Frame, float, float, float]] = field(default_factory=list)
@@ -87,7 +89,9 @@ class Layout:
         """Put up a building where its footprint is free; say whether it was."""
         if claim and not self.occupancy.claim(b.frame, b.width, b.depth):
             return False
-        add_building(self.fixed, b, rng)
+        house = MeshBuilder()
+        add_building(house, b, rng)
+        self.buildings.append(house.build())
         return True
 
     def plant(self, frame: Frame, x: float, y: float, species: Species, height: float) -> None:

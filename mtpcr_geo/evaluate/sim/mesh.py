@@ -32,6 +32,7 @@ class Material(IntEnum):
     METAL = 12
     WIRE = 13
     STONE = 14
+    PASSING = 15
 
 
 # by material: ASPRS class, share of light sent back, standard deviation of the surface's own relief (m)
@@ -51,6 +52,7 @@ _TRAITS = {
     Material.METAL: (1, 0.30, 0.01),
     Material.WIRE: (14, 0.20, 0.01),
     Material.STONE: (1, 0.35, 0.015),
+    Material.PASSING: (1, 0.30, 0.02),
 }
 LAS_CLASS = np.array([_TRAITS[m][0] for m in Material], np.uint8)
 REFLECTANCE = np.array([_TRAITS[m][1] for m in Material])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mtpcr_geo.evaluate.sim.furniture import add_car, add_poles
+from mtpcr_geo.evaluate.sim.furniture import add_car, add_poles, add_traffic, add_walker
 from mtpcr_geo.evaluate.sim.kinds import STYLES, Kind, SiteStyle
 from mtpcr_geo.evaluate.sim.lots import Layout, Occupancy, fill_lots
 from mtpcr_geo.evaluate.sim.mesh import Frame, Mesh, MeshBuilder
@@ -18,6 +18,8 @@ from mtpcr_geo.evaluate.sim.vegetation import Plants, Species, add_plants
 
 Floats = NDArray[np.float64]
 MARGIN_M = 25.0
+# shares of the buildings that are pulled down, and put up, after the first epoch
+RAZED, RAISED = 0.02, 0.02
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,8 @@ class Site:
     def mesh(self, epoch: int, leafiness: float = 1.0) -> Mesh:
         """Give the site's geometry in one epoch.
 
-        Houses and stems stay; leaves, hedges, crops, parked cars and a few trees differ.
+        Most houses and stems stay; leaves, hedges, crops, parked cars, who passes by, a few trees and a few
+        buildings differ.
 
         Args:
             epoch: 0 or later.
@@ -59,10 +62,15 @@ class Site:
         out = MeshBuilder()
         out.add_mesh(self.ground.mesh(_crop(self, rng)))
         out.add_mesh(self.layout.fixed.build())
+        fate = np.random.default_rng([self.seed, 78]).random(len(self.layout.buildings))
+        standing = fate > RAZED if epoch else fate < 1 - RAISED
+        for number in np.flatnonzero(standing):
+            out.add_mesh(self.layout.buildings[number])
         plants = self.plants.aged(rng, gone=0.02 * epoch, growth=0.02 * epoch)
         add_plants(out, plants, self.ground.height(plants.xy), rng, leafiness, self.seed)
         self.layout.grow_hedges(out, rng)
         _park_cars(self, out, rng)
+        _pass_by(self, out, rng)
         return out.build()
 
 
@@ -130,6 +138,32 @@ def _park_cars(site: Site, out: MeshBuilder, rng: np.random.Generator) -> None:
             x, y = line[at] + aside * np.array([np.sin(yaw), -np.cos(yaw)])
             z = float(site.ground.height(np.array([[x, y]]))[0])
             add_car(out, Frame(float(x), float(y), z, yaw + rng.normal(0, 0.03)), rng)
+
+
+def _pass_by(site: Site, out: MeshBuilder, rng: np.random.Generator) -> None:
+    """People on the verges and cars on the lanes, each over a part of a road."""
+    per_metre = site.style.cars_per_100m / 100.0
+    for line, width in zip(site.roads.lines, site.roads.widths, strict=True):
+        if len(line) < 8:
+            continue
+        step = np.gradient(line, axis=0)
+        yaw = np.arctan2(step[:, 1], step[:, 0])
+        right = np.stack([np.sin(yaw), -np.cos(yaw)], axis=1)
+        for _ in range(rng.poisson(0.5 * per_metre * len(line))):
+            at = _stretch(len(line), int(rng.integers(4, 25)), 1, rng)
+            way = line[at] + float(rng.choice([-1.0, 1.0])) * (0.5 * width + 0.4) * right[at]
+            add_walker(out, way, site.ground.height(way), rng)
+        for _ in range(rng.poisson(0.25 * per_metre * len(line))):
+            at = _stretch(len(line), int(rng.integers(25, 90)), 6, rng)
+            way = line[at] + 0.2 * width * right[at]
+            places = np.c_[way, site.ground.height(way), yaw[at]].tolist()
+            add_traffic(out, [Frame(*place) for place in places], rng)
+
+
+def _stretch(count: int, length: int, every: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Draw a part of a road: numbers of its points."""
+    start = int(rng.integers(0, max(1, count - length)))
+    return np.arange(start, min(start + length, count), every)
 
 
 def _poles(layout: Layout, roads: Network, style: SiteStyle, rng: np.random.Generator) -> None:
