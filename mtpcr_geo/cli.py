@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import signal
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,10 +11,11 @@ import typer
 from typer.core import TyperGroup
 
 import mtpcr_geo
+from mtpcr_geo.cli_benchmark import benchmark
+from mtpcr_geo.cli_shared import AsJson, Overwrite, Quiet, Verbose, progress_bars
 from mtpcr_geo.errors import EXIT_DOUBTFUL, EXIT_REFUSED, MtpcrError, OptionError
 
 if TYPE_CHECKING:
-    from mtpcr_geo.pipeline.stage import Progress
     from mtpcr_geo.register import Registration
 
 EXIT_BY_VERDICT = {"accepted": 0, "doubtful": EXIT_DOUBTFUL, "refused": EXIT_REFUSED}
@@ -78,14 +76,6 @@ class Motion(StrEnum):
     rigid = "rigid"
     yaw = "yaw"
     translation = "translation"
-
-
-Verbose = Annotated[
-    bool, typer.Option("--verbose", "-v", help="Say what every stage did and how long it took.")
-]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the run as JSON on standard output.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that are already there.")]
 
 
 def _version(wanted: bool) -> None:
@@ -192,7 +182,7 @@ def register(
     if dump_pipeline:
         typer.echo(dump(build_pipeline(source, target, out, read_options(words))))
         return
-    with _progress(quiet) as progress:
+    with progress_bars(quiet) as progress:
         result = run(source, target, out, progress=progress, **words)
     _report(result, as_json=as_json, verbose=verbose, quiet=quiet)
     raise typer.Exit(EXIT_BY_VERDICT[result.verdict.name])
@@ -239,7 +229,7 @@ def pipeline(
         return
     if file is None:
         raise OptionError("name a pipeline file, or - for standard input")
-    with _progress(quiet, always=progress) as bars:
+    with progress_bars(quiet, always=progress) as bars:
         outcome = commands.run_pipeline(
             file,
             context.args,
@@ -267,7 +257,7 @@ def apply(
     """Stream any cloud through the transform of a run."""
     from mtpcr_geo.cloud.apply import apply_transform
 
-    with _progress(quiet) as progress:
+    with progress_bars(quiet) as progress:
         written = apply_transform(
             transform, cloud, out, inverse=inverse, overwrite=overwrite, progress=progress
         )
@@ -303,7 +293,7 @@ def check(
     from mtpcr_geo.check import check_clouds
     from mtpcr_geo.check.show import show
 
-    with _progress(quiet) as progress:
+    with progress_bars(quiet) as progress:
         report = check_clouds(
             source,
             target,
@@ -343,7 +333,7 @@ def demo(
     """Simulate a town, scan it from a street and from the air, register the two, compare with the truth."""
     from mtpcr_geo.demo import run_demo
 
-    with _progress(quiet) as progress:
+    with progress_bars(quiet) as progress:
         result = run_demo(out, seed=seed, overwrite=overwrite, progress=progress)
     _report(result.registration, as_json=False, verbose=False, quiet=quiet)
     if not quiet:
@@ -351,71 +341,7 @@ def demo(
     raise typer.Exit(EXIT_BY_VERDICT[result.registration.verdict.name])
 
 
-@app.command()
-def benchmark(
-    out: Annotated[
-        Path,
-        typer.Option("--out", "-o", help="Folder of the results; what is there is kept.", show_default=False),
-    ],
-    data: Annotated[
-        list[Path] | None, typer.Option(help="Folder of pairs (source.laz, target.laz, pair.json each).")
-    ] = None,
-    simulated: Annotated[int, typer.Option(help="Number of sites to simulate.")] = 0,
-    standins: Annotated[
-        bool, typer.Option("--standins", help="Simulate the paper's fourteen combinations.")
-    ] = False,
-    graco: Annotated[Path | None, typer.Option(help="Folder of GrAco's bags and calibrations.")] = None,
-    methods: Annotated[
-        list[str],
-        typer.Option("--methods", "-m", help="Methods, with options: 'mtpcr-geo kiss-matcher:voxel=1'."),
-    ] = ["mtpcr-geo"],  # noqa: B006 - typer copies it
-    starts: Annotated[int, typer.Option(min=1, help="Random starts of each pair.")] = 10,
-    jobs: Annotated[int, typer.Option(min=1, help="Runs at a time.")] = 1,
-    yaw: Annotated[float, typer.Option(help="Starts are turned by 0 to this, degrees.")] = 360.0,
-    tilt: Annotated[float, typer.Option(help="Starts are tilted by 0 to this, degrees.")] = 0.0,
-    shift: Annotated[float, typer.Option(help="Starts are moved by 0 to this, metres.")] = 100.0,
-    seed: Annotated[int, typer.Option(help="Seed of the starts.")] = 0,
-    only: Annotated[list[str] | None, typer.Option(help="Pairs whose names contain this.")] = None,
-    kinds: Annotated[
-        str, typer.Option(help="Kinds of simulated sites, such as 'town forest'; else all.")
-    ] = "",
-    overlaps: Annotated[str, typer.Option(help="Overlaps of simulated sites, such as '0.4 0.1'.")] = "0.18",
-    pairs: Annotated[
-        Path | None, typer.Option(help="Folder for pairs that are made; else OUT/pairs.")
-    ] = None,
-    time_limit: Annotated[float, typer.Option(help="Longest a run may take, seconds.")] = 600.0,
-    quiet: Quiet = False,
-) -> None:
-    """Run methods on pairs with a known transform, from random starts; write tables and plots.
-
-    An interrupted benchmark goes on where it stopped when the same command is given again.
-    """
-    from mtpcr_geo.evaluate.benchmark import Wanted, numbers_of, run_benchmark, shown
-    from mtpcr_geo.evaluate.worker import StartRange
-
-    wanted = Wanted(
-        tuple(data or ()),
-        simulated,
-        standins,
-        graco,
-        tuple(only or ()),
-        tuple(kinds.split()),
-        numbers_of(overlaps),
-    )
-    with _progress(quiet) as progress:
-        rows = run_benchmark(
-            wanted,
-            [word for text in methods for word in text.split()],
-            out,
-            pairs=pairs,
-            starts=starts,
-            ranges=StartRange(yaw, tilt, shift, seed),
-            jobs=jobs,
-            time_limit_s=time_limit,
-            progress=progress,
-        )
-    if not quiet:
-        typer.echo(shown(rows) + f"\nTables and plots: {out}")
+app.command()(benchmark)
 
 
 def main() -> None:
@@ -427,19 +353,6 @@ def main() -> None:
 def _interrupt(signum: int, frame: object) -> None:
     # a kill must leave as little behind as Ctrl-C does
     raise KeyboardInterrupt
-
-
-@contextmanager
-def _progress(quiet: bool, always: bool = False) -> Iterator[Progress]:
-    from mtpcr_geo.progress import NoProgress, RichProgress
-
-    if quiet or not (always or sys.stderr.isatty()):
-        yield NoProgress()
-        return
-    from rich.console import Console
-
-    with RichProgress(Console(stderr=True, force_terminal=True if always else None)) as bars:
-        yield bars
 
 
 def _report(result: Registration, *, as_json: bool, verbose: bool, quiet: bool) -> None:
