@@ -19,6 +19,7 @@ from mtpcr_geo.evaluate.benchmark import Wanted, run_benchmark
 from mtpcr_geo.evaluate.plots import binned, cumulative
 from mtpcr_geo.evaluate.protocol import RUNS, read_rows, run_protocol
 from mtpcr_geo.evaluate.rivals import external, fpfh
+from mtpcr_geo.evaluate.sim.raycast import import_open3d
 from mtpcr_geo.evaluate.simulate import write_laz
 from mtpcr_geo.evaluate.worker import StartRange
 
@@ -437,3 +438,22 @@ def test_verb_prints_what_it_found_and_says_what_is_wrong(data, tmp_path):
     assert CliRunner().invoke(app, out).exit_code == 2
     assert CliRunner().invoke(app, [*out, "--data", str(data), "-m", "none"]).exit_code == 2
     assert CliRunner().invoke(app, [*out, "--data", str(tmp_path)]).exit_code == 5
+
+
+@pytest.mark.parametrize(("n", "m"), [(4, 7), (700, 2300), (513, 1), (0, 5)])
+def test_mutual_matches_are_each_others_nearest(n, m):
+    o3d = import_open3d()
+    rng = np.random.default_rng(n)
+    data = [rng.uniform(0, 100, (count, 33)) for count in (n, m)]
+    described = []
+    for one in data:
+        feature = o3d.pipelines.registration.Feature()
+        feature.data = one.T
+        described.append(fpfh.Features(o3d.geometry.PointCloud(), feature))
+    found = fpfh.mutual_matches(*described)
+    if not n:
+        assert found.shape == (0, 2)
+        return
+    squared = (data[0] ** 2).sum(1)[:, None] + (data[1] ** 2).sum(1) - 2 * data[0] @ data[1].T
+    there, back = squared.argmin(axis=1), squared.argmin(axis=0)
+    assert found.tolist() == [[i, j] for i, j in enumerate(there) if back[j] == i]

@@ -20,7 +20,7 @@ from mtpcr_geo.evaluate.sim.raycast import import_open3d
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 _FEWEST_MATCHES = 3
-_BLOCK = 2048
+_ROWS, _COLUMNS = 512, 2048
 
 
 @dataclass(frozen=True)
@@ -63,16 +63,29 @@ def mutual_matches(source: Features, target: Features) -> NDArray[np.int64]:
     a, b = (np.asarray(one.fpfh.data, np.float32).T for one in (source, target))
     if not len(a) or not len(b):
         return np.empty((0, 2), np.int64)
-    there, back = _nearest(a, b), _nearest(b, a)
+    there, back = _nearest_both_ways(a, b)
     mutual = np.flatnonzero(back[there] == np.arange(len(a)))
     return np.stack([mutual, there[mutual]], axis=1)
 
 
-def _nearest(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.int64]:
-    half = (b * b).sum(axis=1) / 2
-    # |a - b|^2 is least where a.b - |b|^2 / 2 is most
-    parts = [(a[k : k + _BLOCK] @ b.T - half).argmax(axis=1) for k in range(0, len(a), _BLOCK)]
-    return np.concatenate(parts).astype(np.int64)
+def _nearest_both_ways(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[Indices, Indices]:
+    """Give each row's nearest in the other array, by blocks of distances that stay in the cache."""
+    one_a, one_b = (np.ones((len(x), 1), np.float32) for x in (a, b))
+    # -|a - b|^2 / 2 as one product
+    long_a = np.hstack([a, one_a * (a * a).sum(axis=1, keepdims=True) / -2, one_a])
+    long_b = np.hstack([b, one_b, one_b * (b * b).sum(axis=1, keepdims=True) / -2])
+    best_a, best_b = (np.full(len(x), -np.inf, np.float32) for x in (a, b))
+    there, back = np.zeros(len(a), np.int64), np.zeros(len(b), np.int64)
+    for i in range(0, len(a), _ROWS):
+        for j in range(0, len(b), _COLUMNS):
+            near = long_a[i : i + _ROWS] @ long_b[j : j + _COLUMNS].T
+            for axis, best, index, own, other in ((1, best_a, there, i, j), (0, best_b, back, j, i)):
+                most = near.max(axis=axis)
+                better = np.flatnonzero(most > best[own : own + len(most)])
+                if len(better):
+                    found = near.take(better, axis=1 - axis).argmax(axis=axis)
+                    index[own + better], best[own + better] = other + found, most[better]
+    return there, back
 
 
 def at_most(matches: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:
