@@ -50,7 +50,8 @@ class CorrelationSettings:
         min_overlap_m2: smallest overlap considered, square metres.
         min_overlap_share: smallest overlap considered, as a share of the smaller raster.
         convincing_margin: best over next distinct score at fine cells that ends the search.
-        convincing_surprise: digits of improbability of its patches' agreement that end it.
+        convincing_surprise: digits of improbability of its patches' agreement that end it. Streets that run
+            alike have given 11 digits to a pose 120 m off, where the true one had 48.
 
     """
 
@@ -60,7 +61,7 @@ class CorrelationSettings:
     min_overlap_m2: float = 400.0
     min_overlap_share: float = 0.03
     convincing_margin: float = 1.5
-    convincing_surprise: float = 8.0
+    convincing_surprise: float = 20.0
 
 
 @dataclass(frozen=True)
