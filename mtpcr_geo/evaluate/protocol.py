@@ -15,7 +15,8 @@ import os
 import platform
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 RUNS, PROTOCOL, LOG = "runs.jsonl", "protocol.json", "methods.log"
 LOADING_LIMIT_S = 600.0
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 FRAME = "metres; origin at the middle of the target's bounds; z up"
 
 
@@ -192,7 +194,8 @@ def _drive(waiting: deque[Task], jobs: int, limit: float, file: TextIO, advance:
                 task = waiting.popleft()
                 mine, theirs = context.Pipe(duplex=False)
                 process = context.Process(target=work, args=(task, theirs), daemon=True)
-                process.start()
+                with _threads_of_children(task.threads):
+                    process.start()
                 theirs.close()
                 running[mine] = _Running(task, process, time.monotonic(), deque(task.starts))
             now = time.monotonic()
@@ -226,6 +229,21 @@ def _drive(waiting: deque[Task], jobs: int, limit: float, file: TextIO, advance:
     finally:
         for one in running.values():
             one.process.terminate()
+
+
+@contextmanager
+def _threads_of_children(count: int) -> Iterator[None]:
+    """Let processes started meanwhile use so many threads: BLAS and OpenMP read that when they are loaded."""
+    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, str(count)))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def _patience(one: _Running, limit: float) -> float:

@@ -61,7 +61,7 @@ class Task:
         method: name and options.
         starts: which of the pair's starts.
         ranges: what they are drawn from.
-        threads: how many the method's libraries may use.
+        threads: how many the method's libraries may use; held to where the process is started.
         log: file to which goes whatever libraries print; nothing is caught if None.
 
     """
@@ -80,7 +80,6 @@ def work(task: Task, parent: Connection) -> None:
     Messages are pairs: for each run ``("begun", {...})`` with what is known before it and ``("row", {...})``
     with the whole result; ``("failed", text)`` where nothing can be run; ``("done", None)`` at the end.
     """
-    os.environ["OMP_NUM_THREADS"] = str(task.threads)
     if task.log is not None:
         # libraries in C++ print past Python's own streams
         file = os.open(task.log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
