@@ -61,6 +61,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         ground_cells=len(steps),
         ground_agreeing=int((np.abs(steps) < GROUND_AGREES_M).sum()),
         refined_away_m=_refined_away(pair, T),
+        refinement_lost=not pair.refine_report.get("icp", {}).get("followed", True),
         final_agreeing=int((residual < tolerance).sum()),
     )
     shift = T[:3, 3]
@@ -91,14 +92,17 @@ def agreement(pair: Pair, T: Floats, tolerance: float | None = None) -> tuple[in
         tolerance: plan distance within which a tie agrees, metres; one cell if None.
 
     """
-    cell = pair.cell
-    ties = 0
-    if pair.ties is not None:
-        T_level = pair.target.T_level_work @ T @ geometry.inverse(pair.source.T_level_work)
-        gap = geometry.apply(T_level, pair.ties.source) - pair.ties.target
-        ties = int((np.hypot(gap[:, 0], gap[:, 1]) < (tolerance or max(cell, 1.0))).sum())
     _, steps = overlap_of(geometry.apply(T, pair.source.sample), pair.target.sample).ground_steps()
-    return ties, int((np.abs(steps) < GROUND_AGREES_M).sum())
+    return ties_agreeing(pair, T, tolerance), int((np.abs(steps) < GROUND_AGREES_M).sum())
+
+
+def ties_agreeing(pair: Pair, T: Floats, tolerance: float | None = None) -> int:
+    """Count the ties that a transform brings together in plan; arguments as for `agreement`."""
+    if pair.ties is None:
+        return 0
+    T_level = pair.target.T_level_work @ T @ geometry.inverse(pair.source.T_level_work)
+    gap = geometry.apply(T_level, pair.ties.source) - pair.ties.target
+    return int((np.hypot(gap[:, 0], gap[:, 1]) < (tolerance or max(pair.cell, 1.0))).sum())
 
 
 def cross_validated(ties: Ties, tolerance: float, solved: dict[str, Any]) -> Floats:

@@ -20,6 +20,8 @@ Mode = Literal["auto", "ransac", "none"]
 
 MAX_TILT_DEG = 25.0
 PLANE_TOLERANCE_M = 0.4
+FEWEST_ON_PLANE = 0.2
+"""Share of the points on the ground plane below which it is one field among many, and says nothing."""
 NEIGHBOURS = 14
 THREADS = 2
 SHAPE_POINTS = 25_000
@@ -53,7 +55,7 @@ def level(xyz: Floats, mode: Mode, georeferenced: bool, seed: int = 0) -> Levell
         xyz: (n, 3) sample of the cloud, metres, z within 25 degrees of up.
         mode: "none" keeps the cloud as it is; "ransac" turns the ground plane horizontal (the paper);
             "auto" keeps georeferenced clouds, whose vertical is known, and levels local ones by the ground
-            plane checked against vertical structure.
+            plane checked against vertical structure; where neither says enough, they are kept.
         georeferenced: whether the cloud's CRS defines its vertical.
         seed: of the random choices.
 
@@ -77,6 +79,9 @@ def level(xyz: Floats, mode: Mode, georeferenced: bool, seed: int = 0) -> Levell
         if plumb.up is not None:
             report |= {"method": "verticals", "plane_to_verticals_deg": _between_deg(up, plumb.up)}
             up, method = plumb.up, "verticals"
+        elif share < FEWEST_ON_PLANE:
+            why = "too little vertical structure, and no ground plane that holds"
+            return Levelling(np.eye(4), "none", report | {"method": "none", "why": why, "tilt_deg": 0.0})
     report["tilt_deg"] = _tilt_deg(up)
     return Levelling(geometry.about(centre, rotation_to_up(up)), method, report)
 

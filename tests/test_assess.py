@@ -45,6 +45,8 @@ def test_good_evidence_is_accepted_with_its_grounds() -> None:
         ({"withheld": 13, "withheld_agreeing": 6, "margin": 1.1}, "refused"),
         ({"margin": None, "support": None}, "accepted"),
         ({"final_agreeing": 10}, "refused"),
+        ({"refinement_lost": True}, "doubtful"),
+        ({"ground_agreeing": 590}, "doubtful"),
     ],
 )
 def test_each_weakness_is_named(change: dict, name: str) -> None:

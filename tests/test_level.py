@@ -62,6 +62,16 @@ def test_open_ground_without_walls_is_levelled_by_its_plane() -> None:
     assert lean_deg(found.T_level_work, R) < 0.2
 
 
+def test_rolling_ground_without_walls_is_kept_as_it_is() -> None:
+    rng = np.random.default_rng(8)
+    xy = rng.uniform(-200, 200, (60_000, 2))
+    hills = 8.0 * np.sin(xy[:, 0] / 45.0) * np.cos(xy[:, 1] / 60.0) + 0.01 * xy[:, 0]
+    found = level(np.column_stack([xy, hills]), "auto", georeferenced=False)
+    assert found.method == "none"
+    assert np.array_equal(found.T_level_work, np.eye(4))
+    assert found.report["plane_inlier_share"] < 0.2
+
+
 def test_levelling_is_the_same_at_each_run() -> None:
     xyz = street(np.random.default_rng(9))
     a, b = (level(xyz, "auto", georeferenced=False, seed=3).T_level_work for _ in range(2))

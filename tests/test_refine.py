@@ -6,8 +6,11 @@ from helpers_scene import houses
 
 from mtpcr_geo import geometry
 from mtpcr_geo.errors import RegistrationError
+from mtpcr_geo.evaluate.steps import follow, level_pair
+from mtpcr_geo.evidence import ties_agreeing
 from mtpcr_geo.overlap import overlap_of
 from mtpcr_geo.refine import icp, reaches_for, settle_on_ground
+from mtpcr_geo.scene import Ties
 
 
 @pytest.fixture(scope="module")
@@ -80,3 +83,24 @@ def test_reaches_stop_at_the_spacing() -> None:
     assert reaches_for(1.0) == (3.0, 1.5, 0.75)
     assert reaches_for(2.0) == (3.0, 1.5)
     assert reaches_for(4.0) == (3.0, 1.5)
+
+
+@pytest.mark.parametrize("keep_ties", [0.5, 0.0])
+def test_icp_that_loses_the_ties_is_followed_only_where_that_is_asked(clouds, keep_ties: float) -> None:
+    pair = level_pair(*clouds, "none")
+    aside = off_by(0.0, (2.2, -1.2, 0.0))
+    rng = np.random.default_rng(2)
+    place = rng.uniform(-40, 40, (60, 3)) * [1, 1, 0]
+    # ties that agree on a pose from which ICP goes away, to where the clouds fit
+    ties = Ties(
+        place, geometry.apply(aside, place), np.ones(60), np.arange(60) % 4, np.arange(60) % 4 == 0,
+        np.ones(60, bool),
+    )  # fmt: skip
+    pair = pair.with_(ties=ties, T_target_source=aside)
+    step = {"type": "mtpcr.refine", "tag": "refine", "keep_ties": keep_ties}
+    refined = follow(pair, [step]).pair
+    followed = keep_ties == 0.0
+    assert refined.refine_report["icp"]["followed"] is followed
+    assert ties_agreeing(refined, refined.T_target_source) == (0 if followed else 60)
+    plan = np.linalg.norm(refined.T_target_source[:2, 3])
+    assert plan < 0.05 if followed else plan == pytest.approx(np.hypot(2.2, 1.2), abs=0.05)

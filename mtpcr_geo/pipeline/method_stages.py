@@ -186,6 +186,13 @@ class RefineOptions(StageOptions):
         "rigid", description="degrees of freedom of the result: all six, yaw and shift, or the shift alone"
     )
     ground: bool = Field(True, description="settle height and tilt on the ground before, and height after")
+    keep_ties: float = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="share of the agreeing ties that must still agree after ICP for it to be followed; on "
+        "open ground it may slide. 0 to follow it always",
+    )
 
 
 class Refine(Stage):
@@ -197,6 +204,7 @@ class Refine(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Refine the solved transform."""
+        from mtpcr_geo.evidence import ties_agreeing
         from mtpcr_geo.refine import beyond_scatter, constrain, icp, reaches_for, settle_on_ground
 
         pair = self.one_pair(inputs)
@@ -219,7 +227,10 @@ class Refine(Stage):
                 most_points=self.options.max_points,
                 iterations=self.options.iterations,
             )
-            T, report["icp"] = refined.T, refined.report
+            # on open ground nothing holds points in plan but what the ties have seen
+            followed = ties_agreeing(pair, refined.T) >= self.options.keep_ties * ties_agreeing(pair, T)
+            report["icp"] = {**refined.report, "followed": followed}
+            T = refined.T if followed else T
         if self.options.ground:
             settled = settle_on_ground(source, target, T, tilt=False)
             followed = self.options.method == "none" or beyond_scatter(settled)

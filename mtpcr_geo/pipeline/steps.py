@@ -93,7 +93,13 @@ def _paper_method(options: MethodOptions, seed: dict[str, int]) -> list[dict[str
         *steps,
         {"type": "mtpcr.lift", "tag": "lift", "surface": "grey", "pixel": "ceil", **seed},
         {"type": "mtpcr.solve", "tag": "solve", "upright": False, "robust_start": False, **seed},
-        {"type": "mtpcr.refine", "tag": "refine", "method": "point_to_point", "ground": False},
+        {
+            "type": "mtpcr.refine",
+            "tag": "refine",
+            "method": "point_to_point",
+            "ground": False,
+            "keep_ties": 0,
+        },
         {"type": "mtpcr.assess", "tag": "assess"},
     ]
 
