@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.errors import MissingPartError
+from mtpcr_geo.evaluate.methods import options_of
 from mtpcr_geo.evaluate.tables import LENIENT, Row, answered, grouped, success
 
 Floats = NDArray[np.float64]
@@ -90,7 +91,7 @@ def _draw_cumulative(figure: Any, rows: Sequence[Row]) -> None:
             if len(x):
                 # from the axis up, and not below a millimetre or a thousandth of a degree
                 x, y = np.maximum(np.r_[x[0], x], 1e-3), np.r_[0.0, y]
-                axis.step(x, y, where="post", label=method, **_style(k))
+                axis.step(x, y, where="post", label=_short(method), **_style(k))
         axis.axvline(limit, color="0.7", linewidth=1, zorder=0)
         axis.set(xscale="log", xlabel=unit, ylim=(0, 102))
         axis.grid(alpha=0.25)
@@ -125,7 +126,7 @@ def _rates(axis: Any, rows: Sequence[Row], of: Callable[[Row], float], edges: Se
             [b["success_pct"] for b in bins],
             marker="o",
             markersize=4,
-            label=method,
+            label=_short(method),
             **_style(k),
         )
     axis.set_ylim(-3, 103)
@@ -135,6 +136,12 @@ def _rates(axis: Any, rows: Sequence[Row], of: Callable[[Row], float], edges: Se
 
 def _rate_name() -> str:
     return f"success ({LENIENT[0]:g} degrees, {LENIENT[1]:g} m), %"
+
+
+def _short(method: str) -> str:
+    """Give an external method by its file's name, "external:file=there/codem.json" as "codem"."""
+    file = options_of(method).get("file")
+    return method if file is None else Path(str(file)).stem
 
 
 def _style(k: int) -> dict[str, Any]:
