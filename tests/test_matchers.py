@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 from helpers_scene import YAW, make_pair
@@ -220,12 +221,26 @@ def test_rasters_of_different_cells_match():
 
 
 def test_superpoint_and_lightglue_of_random_weights_run_the_whole_path(town_files, small_models, tmp_path):
-    result = register(*town_files, tmp_path / "out", matcher="superpoint", models=small_models, cell=0.5)
+    # random weights tell places apart only where both images show the same points, and bear no turn: most of
+    # the target again, turned by one of the orientations tried
+    target = town_files[1]
+    las = laspy.read(target)
+    rng = np.random.default_rng(3)
+    las.points = las.points[rng.random(len(las.points)) < 0.9]
+    xyz = np.asarray(las.xyz) + rng.normal(0.0, 0.004, (len(las.points), 3))
+    turn = geometry.about(xyz.mean(axis=0).round(), geometry.yaw_matrix(-np.pi / 2))
+    las.xyz = geometry.apply(turn, xyz) + [21.0, -14.0, 3.0]
+    las.write(tmp_path / "turned.laz")
+    result = register(
+        tmp_path / "turned.laz", target, tmp_path / "out", matcher="superpoint", models=small_models, cell=0.5
+    )
     match = next(entry for entry in result.report if entry["type"] == "mtpcr.match")["metadata"]
     assert match["method"] == "superpoint"
     assert len(match["turns_deg"]) == 8
-    # random projections of patches tell places apart: the yaw is found
-    assert np.degrees(geometry.yaw_of(result.T_target_source[:3, :3])) == pytest.approx(61.0, abs=0.5)
+    # random projections of patches tell places apart: the yaw is found, and not by ICP alone
+    assert match["turn_deg"] == 90.0
+    assert max(match["turn_agreeing"]) > 10
+    assert np.degrees(geometry.yaw_of(result.T_target_source[:3, :3])) == pytest.approx(90.0, abs=0.5)
     from rerun.chunk import RrdReader
 
     chunks = RrdReader(str(tmp_path / "out" / "audit.rrd")).stream().to_chunks()
