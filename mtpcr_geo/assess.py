@@ -43,9 +43,9 @@ class Evidence:
         overlap_source, overlap_target: shares of each cloud's area that lie in the overlap.
         ground_cells: cells where both see the ground.
         ground_agreeing: of these, cells whose heights agree.
-        refined_away_m: how far the refinement moved the overlap from the solution, metres.
+        refined_away_m: how far the refinement moved the overlap from the solution in plan, metres.
         final_agreeing: of all ties, those that agree with the final transform; None if not counted.
-        refinement_lost: whether the refinement lost the ties, so that it was not followed.
+        refinement_lost: whether surfaces fit better where the ties do not agree, and the ties were followed.
 
     """
 

@@ -61,7 +61,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         ground_cells=len(steps),
         ground_agreeing=int((np.abs(steps) < GROUND_AGREES_M).sum()),
         refined_away_m=_refined_away(pair, T),
-        refinement_lost=not pair.refine_report.get("icp", {}).get("followed", True),
+        refinement_lost=pair.refine_report.get("icp", {}).get("lost_ties", False),
         final_agreeing=int((residual < tolerance).sum()),
     )
     shift = T[:3, 3]
@@ -137,13 +137,19 @@ def cross_validated(ties: Ties, tolerance: float, solved: dict[str, Any]) -> Flo
 
 
 def _refined_away(pair: Pair, T: Floats) -> float:
+    """How far the refinement moved the middle of the ties in plan, metres.
+
+    Height is not counted: ties are matched in plan, and take theirs from levelled rasters, which a degree
+    of tilt raises by metres. That of the result is judged by the ground.
+    """
     before = pair.refine_report.get("T_before")
     if before is None or pair.ties is None or not len(pair.ties.source):
         return 0.0
     middle = geometry.apply(
         geometry.inverse(pair.source.T_level_work), pair.ties.source.mean(axis=0, keepdims=True)
     )
-    return float(np.linalg.norm(geometry.apply(T, middle) - geometry.apply(before, middle)))
+    moved = geometry.apply(T, middle)[0] - geometry.apply(before, middle)[0]
+    return float(np.hypot(*(pair.target.T_level_work[:3, :3] @ moved)[:2]))
 
 
 def _uncertainty(ties: Ties, residual: Floats, tolerance: float, centroid: Floats) -> dict[str, Any]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo import geometry
+from mtpcr_geo.shape import local_shapes
 
 Floats = NDArray[np.float64]
 Mode = Literal["auto", "ransac", "none"]
@@ -172,11 +173,8 @@ def plumb_line(xyz: Floats, about: Floats, rng: np.random.Generator) -> PlumbLin
     if len(xyz) < 10 * NEIGHBOURS:
         return nothing
     chosen = xyz if len(xyz) <= SHAPE_POINTS else xyz[rng.choice(len(xyz), SHAPE_POINTS, replace=False)]
-    index, _ = small_gicp.KdTree(xyz, THREADS).batch_knn_search(chosen, NEIGHBOURS, THREADS)
-    index = index.astype(np.int64)
-    hood = xyz[index] - xyz[index].mean(axis=1, keepdims=True)
-    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", hood, hood))
-    spread = np.sqrt(np.maximum(values, 0.0))
+    tree = small_gicp.KdTree(xyz, THREADS)
+    spread, vectors = local_shapes(tree, xyz, chosen, NEIGHBOURS, THREADS)
     flat = (spread[:, 1] > 4 * spread[:, 0]) & (spread[:, 1] > 0.3 * spread[:, 2])
     thin_ = spread[:, 2] > 5 * spread[:, 1]
     within = np.sin(np.radians(PLUMB_WITHIN_DEG))

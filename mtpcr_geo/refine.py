@@ -1,7 +1,8 @@
-"""Refinement: ICP on thinned points of the overlap, with the height settled on the ground."""
+"""Refinement: the height settled on the ground, and ICP followed where surfaces and ties bear it out."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -9,25 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo import geometry
-from mtpcr_geo.errors import RegistrationError
+from mtpcr_geo.icp import Descent, Method, Surfaces
 from mtpcr_geo.overlap import Overlap, overlap_of
 
 Floats = NDArray[np.float64]
-Method = Literal["gicp", "point_to_plane", "point_to_point", "none"]
-
 Motion = Literal["rigid", "yaw", "translation"]
 
-_SMALL_GICP_NAMES = {"gicp": "GICP", "point_to_plane": "PLANE_ICP", "point_to_point": "ICP"}
-FEWEST_POINTS = 200
-FIRST_REACH_M = 3.0
-MOST_CUBES = 30_000_000
-STILL_RAD = 4e-6
-STILL_M = 1e-4
-DENSE_CUBES = 2.5
-"""Points a cube of the thinning above which cubes give their mean point, and below which all are taken."""
-
-LATTICE_M = 0.00037
-"""Shift of the thinning's cubes off whole millimetres, where points of a LAS scale lie in numbers."""
 FEWEST_GROUND_CELLS = 30
 CORRELATED_CELLS = 50
 GROUND_NOISE_M = 0.5
@@ -49,164 +37,68 @@ class Refinement:
     report: dict[str, Any] = field(default_factory=dict)
 
 
-def icp(
-    source: Floats,
-    target: Floats,
-    T_start: Floats,
+def follow_icp(
+    surfaces: dict[str, Surfaces],
+    starts: dict[str, Floats],
     *,
+    reaches: dict[str, tuple[float, ...]],
+    agreeing: Callable[[Floats], int],
+    keep_ties: float,
     method: Method = "gicp",
-    voxel_m: float = 0.5,
-    reach_m: tuple[float, ...] = (3.0, 1.5, 0.75),
-    most_points: int = 30_000,
-    neighbours: int = 10,
     iterations: int = 30,
-    threads: int = 2,
 ) -> Refinement:
-    """Refine by iterative closest points on the overlap (small_gicp).
+    """Run ICP with several reaches, and take what the surfaces fit best, the starts themselves among it.
 
-    The optimiser runs on one thread: sums over several would differ in their last bits from run to run.
+    A far reach catches starts that are off by metres, but on open ground it lets the clouds slide; a near
+    one does not. Neither is right where crops or bushes grew between the surveys and hold the least squares
+    off the ground, which `Surfaces.misfit` sees through. In plan only the ties have seen anything on open
+    ground, so what loses them is not followed.
 
     Args:
-        source, target: (n, 3) and (m, 3) work coordinates, metres.
-        T_start: 4x4 start, source to target.
-        method: "gicp" (plane to plane), "point_to_plane", or "point_to_point" (the paper's citation).
-        voxel_m: thinning, metres.
-        reach_m: farthest correspondence of each round, metres.
-        most_points: of the source after thinning; the target, which costs less, may have three times as many.
-        neighbours: points that tell a surface's direction.
+        surfaces: of both clouds.
+        starts: 4x4 from source to target work coordinates by name; ICP starts from the last.
+        reaches: rounds of each run of ICP, metres, by name.
+        agreeing: counts the ties that a transform brings together.
+        keep_ties: share of the ties agreeing at the last start that must still agree; 0 follows ICP always.
+        method: of `Surfaces.descend`.
         iterations: at most, each round.
-        threads: for thinning and surfaces.
-
-    Raises:
-        RegistrationError: if the clouds hardly overlap under the start.
 
     """
-    import small_gicp
-
-    moved = geometry.apply(T_start, source)
-    overlap = overlap_of(moved, target)
-    of_source, of_target = (np.flatnonzero(overlap.select(xyz)) for xyz in (moved, target))
-    s, t = moved[of_source], target[of_target]
-    if min(len(s), len(t)) >= FEWEST_POINTS:
-        near_s, near_t = _near(s, t, reach_m[0]), _near(t, s, reach_m[0])
-        of_source, of_target = of_source[near_s], of_target[near_t]
-        s, t = source[of_source], target[of_target]
-    if min(len(s), len(t)) < FEWEST_POINTS:
-        raise RegistrationError(
-            f"only {min(len(s), len(t))} points of one cloud lie in the overlap, too few to refine"
-        )
-    pivot = np.floor(t.mean(axis=0))
-    # each cloud is thinned in its own frame, so that a hair's breadth at the start changes no point
-    s = geometry.apply(T_start, _thinned(source[of_source], of_source, voxel_m, most_points))
-    t = _thinned(t, of_target, voxel_m, 3 * most_points)
-    ps, pt = small_gicp.PointCloud(s - pivot), small_gicp.PointCloud(t - pivot)
-    tree = small_gicp.KdTree(pt, threads)
-    if method != "point_to_point":
-        small_gicp.estimate_normals_covariances(ps, small_gicp.KdTree(ps, threads), neighbours, threads)
-        small_gicp.estimate_normals_covariances(pt, tree, neighbours, threads)
-    X, rounds = np.eye(4), []
-    for reach in reach_m:
-        # what a round leaves is taken up by the next; only the last must stand still
-        patience = 1.0 if reach == reach_m[-1] else 25.0
-        result = small_gicp.align(
-            pt,
-            ps,
-            tree,
-            X,
-            registration_type=_SMALL_GICP_NAMES[method],
-            max_correspondence_distance=reach,
-            num_threads=1,
-            max_iterations=iterations,
-            rotation_epsilon=patience * STILL_RAD,
-            translation_epsilon=patience * STILL_M,
-        )
-        X = np.array(result.T_target_source)
-        rounds.append(
-            {
-                "reach_m": reach,
-                "iterations": int(result.iterations),
-                "inliers": int(result.num_inliers),
-                "converged": bool(result.converged),
-            }
-        )
-    X[:3, :3] = geometry.orthonormal(X[:3, :3])
-    T = geometry.translation(pivot) @ X @ geometry.translation(-pivot) @ T_start
+    *_, last = starts
+    runs = {
+        name: surfaces[name].descend(starts[last], reach_m=rounds, method=method, iterations=iterations)
+        for name, rounds in reaches.items()
+    }
+    tried = {name: T for name, T in starts.items() if keep_ties > 0} | {
+        name: run.T for name, run in runs.items()
+    }
+    wanted = keep_ties * agreeing(starts[last])
+    judge = next(iter(surfaces.values()))
+    misfit = {name: judge.misfit(T) for name, T in tried.items()}
+    ties = {name: agreeing(T) for name, T in tried.items()}
+    kept = [name for name in tried if name == last or ties[name] >= wanted]
+    best = min(kept, key=misfit.__getitem__)
+    lost = [name for name in runs if name not in kept and misfit[name] < misfit[best]]
     report = {
         "method": method,
-        "voxel_m": voxel_m,
-        "points_source": int(ps.size()),
-        "points_target": int(pt.size()),
-        "rounds": rounds,
-        "moved_m": float(np.linalg.norm(X[:3, 3])),
-        "turned_deg": float(np.degrees(geometry.rotation_angle(X[:3, :3]))),
+        "voxel_m": judge.voxel_m,
+        "points_source": judge.sizes[0],
+        "points_target": judge.sizes[1],
+        "tried": {name: {"misfit": misfit[name], "ties": ties[name]} for name in tried},
+        "chosen": best,
+        "followed": best in runs,
+        "lost_ties": bool(lost),
+        **_moved(runs, best, starts[last]),
     }
-    return Refinement(T, report)
+    return Refinement(tried[best], report)
 
 
-def _near(points: Floats, others: Floats, reach: float) -> NDArray[np.bool_]:
-    """Tell which points may have one of the others within reach, by cubes of that edge."""
-    (low_p, high_p), (low_o, high_o) = geometry.bounds(points), geometry.bounds(others)
-    span = np.maximum(high_p, high_o) - np.minimum(low_p, low_o)
-    edge = max(reach, float(np.cbrt(np.prod(span + 4 * reach) / MOST_CUBES)))
-    low = np.minimum(low_p, low_o) - 2 * edge
-    shape = np.floor(span / edge).astype(int) + 5
-    filled = np.zeros(tuple(shape.tolist()), dtype=np.bool_)
-    filled[tuple(np.floor((others - low) / edge).astype(np.int64).T)] = True
-    for axis in range(3):
-        # cubes beside a filled one along each axis in turn: all 26 neighbours in the end
-        ahead, behind = np.roll(filled, 1, axis), np.roll(filled, -1, axis)
-        filled = filled | ahead | behind
-    return np.asarray(filled[tuple(np.floor((points - low) / edge).astype(np.int64).T)])
-
-
-def _thinned(xyz: Floats, number: NDArray[np.int64], voxel: float, most: int) -> Floats:
-    """Thin (n, 3) points to at most so many, (m, 3), in a way that hangs on the points and not on the frame.
-
-    Dense clouds give one mean point a cube. Where cubes would hold hardly more than a point each, the
-    points are taken as they are, since a lattice of cubes in another CRS would cut them otherwise. What is
-    too many is left out by a hash of the cube, or of the point's number: if one comes or goes, the choice
-    among all others stays.
-
-    Args:
-        xyz: points, metres.
-        number: (n,) the points' numbers in their cloud.
-        voxel: edge of a cube, metres.
-        most: points at most.
-
-    """
-    import small_gicp
-
-    first = np.floor(geometry.bounds(xyz)[0] / voxel) - 1
-    corner = first * voxel + LATTICE_M
-    thin = np.asarray(small_gicp.voxelgrid_sampling(xyz - corner, voxel, 1).points())[:, :3]
-    if len(xyz) < DENSE_CUBES * len(thin):
-        names, thin = number[:, None], xyz - corner
-    else:
-        names = (np.floor(thin / voxel) + first).astype(np.int64)
-    if len(thin) > most:
-        thin = thin[np.sort(np.argpartition(_hash(names), most)[:most])]
-    return thin + corner
-
-
-def _hash(names: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """Scatter (n, k) whole numbers over 64 bits: (n,)."""
-    key = np.zeros(len(names), np.uint64)
-    for column in names.T.astype(np.uint64):
-        key = (key ^ column) * np.uint64(0x9E3779B97F4A7C15)
-        key ^= key >> np.uint64(29)
-    return key
-
-
-def reaches_for(cell: float) -> tuple[float, ...]:
-    """Choose the rounds' reaches for clouds rasterised at ``cell`` metres: 3 m, halved to the spacing."""
-    reaches = [FIRST_REACH_M]
-    while reaches[-1] / 2 >= 0.75 * cell:
-        reaches.append(reaches[-1] / 2)
-        if len(reaches) == 3:
-            break
-    if len(reaches) == 1:
-        reaches.append(FIRST_REACH_M / 2)
-    return tuple(reaches)
+def _moved(runs: dict[str, Descent], best: str, T_start: Floats) -> dict[str, Any]:
+    """Tell what the run that was followed did; nothing if none was."""
+    if best not in runs:
+        return {}
+    turn = runs[best].T[:3, :3] @ T_start[:3, :3].T
+    return {"rounds": runs[best].rounds, "turned_deg": float(np.degrees(geometry.rotation_angle(turn)))}
 
 
 def settle_on_ground(

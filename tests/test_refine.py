@@ -8,8 +8,9 @@ from mtpcr_geo import geometry
 from mtpcr_geo.errors import RegistrationError
 from mtpcr_geo.evaluate.steps import follow, level_pair
 from mtpcr_geo.evidence import ties_agreeing
+from mtpcr_geo.icp import FAR_REACH_M, NEAR_REACH_M, Method, Surfaces, reaches_for
 from mtpcr_geo.overlap import overlap_of
-from mtpcr_geo.refine import icp, reaches_for, settle_on_ground
+from mtpcr_geo.refine import follow_icp, settle_on_ground
 from mtpcr_geo.scene import Ties
 
 
@@ -23,32 +24,36 @@ def off_by(yaw_deg: float, shift: tuple[float, float, float]) -> np.ndarray:
     return geometry.compose(geometry.yaw_matrix(np.radians(yaw_deg)), np.array(shift))
 
 
+def icp(source: np.ndarray, target: np.ndarray, T_start: np.ndarray, method: Method = "gicp") -> np.ndarray:
+    return Surfaces(source, target, T_start).descend(T_start, reach_m=(3.0, 1.5, 0.75), method=method).T
+
+
 @pytest.mark.parametrize(
     ("method", "within"), [("gicp", 0.01), ("point_to_plane", 0.01), ("point_to_point", 0.06)]
 )
-def test_icp_comes_back_from_a_rough_start(clouds, method: str, within: float) -> None:
+def test_icp_comes_back_from_a_rough_start(clouds, method: Method, within: float) -> None:
     source, target = clouds
-    found = icp(source, target, off_by(0.7, (0.8, -0.6, 0.4)), method=method)  # type: ignore[arg-type]
+    found = icp(source, target, off_by(0.7, (0.8, -0.6, 0.4)), method)
     corners = np.array([[50.0, 50, 0], [-50, 50, 0], [-50, -50, 0], [50, -50, 5]])
-    assert np.linalg.norm(geometry.apply(found.T, corners) - corners, axis=1).max() < within
+    assert np.linalg.norm(geometry.apply(found, corners) - corners, axis=1).max() < within
 
 
 def test_icp_does_not_hang_on_its_start_or_on_round_off(clouds) -> None:
     source, target = clouds
     corners = np.array([[50.0, 50, 0], [-50, 50, 0], [-50, -50, 0], [50, -50, 5]])
-    plain = geometry.apply(icp(source, target, off_by(0.0, (0.0, 0.0, 0.0))).T, corners)
-    elsewhere = geometry.apply(icp(source, target, off_by(-0.2, (0.2, 0.1, 0.1))).T, corners)
+    plain = geometry.apply(icp(source, target, off_by(0.0, (0.0, 0.0, 0.0))), corners)
+    elsewhere = geometry.apply(icp(source, target, off_by(-0.2, (0.2, 0.1, 0.1))), corners)
     assert np.linalg.norm(elsewhere - plain, axis=1).max() < 0.001
     rng = np.random.default_rng(5)
     noisy = [cloud + rng.normal(0.0, 1e-4, cloud.shape) for cloud in clouds]
-    again = geometry.apply(icp(*noisy, off_by(0.0, (1e-3, 0.0, 0.0))).T, corners)
+    again = geometry.apply(icp(*noisy, off_by(0.0, (1e-3, 0.0, 0.0))), corners)
     assert np.linalg.norm(again - plain, axis=1).max() < 0.001
 
 
 def test_icp_is_the_same_at_each_run(clouds) -> None:
     source, target = clouds
     start = off_by(0.4, (0.5, 0.2, -0.3))
-    assert np.array_equal(icp(source, target, start).T, icp(source, target, start).T)
+    assert np.array_equal(icp(source, target, start), icp(source, target, start))
 
 
 def test_without_overlap_refinement_is_refused(clouds) -> None:
@@ -79,10 +84,64 @@ def test_overlap_is_what_both_fill() -> None:
     assert overlap.select(a).mean() == pytest.approx(0.4, abs=0.05)
 
 
-def test_reaches_stop_at_the_spacing() -> None:
-    assert reaches_for(1.0) == (3.0, 1.5, 0.75)
-    assert reaches_for(2.0) == (3.0, 1.5)
-    assert reaches_for(4.0) == (3.0, 1.5)
+def test_reaches_grow_with_coarse_cells() -> None:
+    assert reaches_for(1.0) == reaches_for(2.0) == (FAR_REACH_M, NEAR_REACH_M)
+    assert reaches_for(4.0) == (
+        tuple(2 * reach for reach in FAR_REACH_M),
+        tuple(2 * reach for reach in NEAR_REACH_M),
+    )
+
+
+def test_misfit_is_least_where_surfaces_meet_and_goes_with_the_frame(clouds) -> None:
+    source, target = clouds
+    surfaces = Surfaces(source, target, np.eye(4))
+    true = surfaces.misfit(np.eye(4))
+    assert 0.0 < true < 0.1
+    for off in (off_by(0.4, (0, 0, 0)), off_by(0.0, (0.3, -0.2, 0.0)), off_by(0.0, (0, 0, 0.15))):
+        assert surfaces.misfit(off) > true + 0.02
+    assert surfaces.misfit(off_by(0.0, (0.0, 0.0, 500.0))) == pytest.approx(1.0, abs=1e-4)
+    turn = off_by(50.0, (3000.0, -2000.0, 100.0))
+    elsewhere = Surfaces(source, geometry.apply(turn, target), turn)
+    assert elsewhere.misfit(turn) == pytest.approx(true, abs=0.01)
+
+
+def grown_fields(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rolling farmland with furrows twice; in the target a crop stands 0.7 m high on the eastern part."""
+    rng = np.random.default_rng(seed)
+
+    def scan(n: int) -> np.ndarray:
+        xy = rng.uniform(-60.0, 60.0, (n, 2))
+        rolling = 1.5 * np.sin(xy[:, 0] / 25.0) + np.cos(xy[:, 1] / 18.0)
+        furrows = 0.25 * np.sin(0.9 * xy[:, 0]) * np.sin(0.7 * xy[:, 1])
+        return np.column_stack([xy, rolling + furrows + rng.normal(0.0, 0.02, n)])
+
+    source, target = scan(50_000), scan(50_000)
+    crop = target[:, 0] > 10.0
+    target[crop, 2] += 0.7 + rng.normal(0.0, 0.1, int(crop.sum()))
+    return source, target
+
+
+def test_crops_that_lead_icp_off_the_ground_are_seen_through() -> None:
+    source, target = grown_fields(3)
+    corners = np.array([[50.0, 50, 0], [-50, 50, 0], [-50, -50, 0], [50, -50, 0]])
+
+    def off(T: np.ndarray) -> float:
+        return float(np.abs(geometry.apply(T, corners) - corners).max())
+
+    start = off_by(0.0, (0.05, -0.05, 0.02))
+    surfaces = Surfaces(source, target, start)
+    led_off = surfaces.descend(start, reach_m=(*FAR_REACH_M, *NEAR_REACH_M)).T
+    found = follow_icp(
+        {"far": surfaces},
+        {"ties": start},
+        reaches={"far": (*FAR_REACH_M, *NEAR_REACH_M)},
+        agreeing=lambda T: 10,
+        keep_ties=0.5,
+    )
+    assert off(led_off) > 0.3
+    assert off(found.T) < 0.1
+    assert not found.report["followed"]
+    assert not found.report["lost_ties"]
 
 
 @pytest.mark.parametrize("keep_ties", [0.5, 0.0])
@@ -101,6 +160,7 @@ def test_icp_that_loses_the_ties_is_followed_only_where_that_is_asked(clouds, ke
     refined = follow(pair, [step]).pair
     followed = keep_ties == 0.0
     assert refined.refine_report["icp"]["followed"] is followed
+    assert refined.refine_report["icp"]["lost_ties"] is not followed
     assert ties_agreeing(refined, refined.T_target_source) == (0 if followed else 60)
     plan = np.linalg.norm(refined.T_target_source[:2, 3])
     assert plan < 0.05 if followed else plan == pytest.approx(np.hypot(2.2, 1.2), abs=0.05)

@@ -174,7 +174,8 @@ class RefineOptions(StageOptions):
     reach: list[float] | None = Field(
         None,
         min_length=1,
-        description="farthest correspondence of each round, metres; from the cell if not given",
+        description="farthest correspondence of each round, metres; if not given, far and near rounds are "
+        "tried, and what the surfaces fit best is taken",
     )
     max_points: int = Field(
         30_000,
@@ -191,7 +192,7 @@ class RefineOptions(StageOptions):
         ge=0,
         le=1,
         description="share of the agreeing ties that must still agree after ICP for it to be followed; on "
-        "open ground it may slide. 0 to follow it always",
+        "open ground it may slide. 0 to follow it always, however the surfaces fit",
     )
 
 
@@ -205,32 +206,46 @@ class Refine(Stage):
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Refine the solved transform."""
         from mtpcr_geo.evidence import ties_agreeing
-        from mtpcr_geo.refine import beyond_scatter, constrain, icp, reaches_for, settle_on_ground
+        from mtpcr_geo.icp import Surfaces, reaches_for, shared_points
+        from mtpcr_geo.refine import beyond_scatter, constrain, follow_icp, settle_on_ground
 
         pair = self.one_pair(inputs)
         if pair.T_target_source is None:
             raise OptionError(f"{self.label} needs a transform; put mtpcr.solve before it")
         source, target, T = pair.source.sample, pair.target.sample, pair.T_target_source
         report: dict[str, object] = {}
+        starts = {"ties": T}
         if self.options.ground:
             settled = settle_on_ground(source, target, T, tilt=True)
             T, report["ground_before"] = settled.T, settled.report
+            starts["ground"] = T
         if self.options.method != "none":
-            reach = self.options.reach or reaches_for(pair.cell)
-            refined = icp(
-                source,
-                target,
-                T,
+            far, near = reaches_for(pair.cell)
+            asked = self.options.reach
+            reaches = {"asked": tuple(asked)} if asked else {"far": (*far, *near), "near": near}
+            shared = shared_points(source, target, T)
+            surfaces = {
+                name: Surfaces(
+                    source,
+                    target,
+                    T,
+                    voxel_m=self.options.voxel,
+                    reach_m=max(rounds),
+                    most_points=self.options.max_points,
+                    shared=shared,
+                )
+                for name, rounds in reaches.items()
+            }
+            refined = follow_icp(
+                surfaces,
+                starts,
+                reaches=reaches,
+                agreeing=lambda T: ties_agreeing(pair, T),
+                keep_ties=self.options.keep_ties,
                 method=self.options.method,
-                voxel_m=self.options.voxel,
-                reach_m=tuple(reach),
-                most_points=self.options.max_points,
                 iterations=self.options.iterations,
             )
-            # on open ground nothing holds points in plan but what the ties have seen
-            followed = ties_agreeing(pair, refined.T) >= self.options.keep_ties * ties_agreeing(pair, T)
-            report["icp"] = {**refined.report, "followed": followed}
-            T = refined.T if followed else T
+            T, report["icp"] = refined.T, refined.report
         if self.options.ground:
             settled = settle_on_ground(source, target, T, tilt=False)
             followed = self.options.method == "none" or beyond_scatter(settled)

@@ -1,0 +1,34 @@
+"""The shape of a point's surroundings: how far they spread along their principal axes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def local_shapes(
+    tree: Any, points: Floats, places: Floats, neighbours: int, threads: int
+) -> tuple[Floats, Floats]:
+    """Find the principal axes of the points around each place.
+
+    Args:
+        tree: small_gicp's KdTree of the points.
+        points: (n, 3) metres.
+        places: (m, 3) metres.
+        neighbours: points around a place that are looked at.
+        threads: for the search.
+
+    Returns:
+        (m, 3) spreads in rising order (square roots of the scatter's eigenvalues), and (m, 3, 3) axes in
+        columns: of a flat place the first is its normal, of a thin one the last its direction.
+
+    """
+    index = np.asarray(tree.batch_knn_search(places, neighbours, threads)[0]).astype(np.int64)
+    hood = points[index]
+    hood = hood - hood.mean(axis=1, keepdims=True)
+    values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", hood, hood))
+    return np.sqrt(np.maximum(values, 0.0)), axes
