@@ -11,6 +11,16 @@ from mtpcr_geo.crs import FrameLink, WorkFrame
 from mtpcr_geo.raster import Grid
 from mtpcr_geo.scene import Bev, Hypothesis, Matches, Pair, Side, Ties, Verdict
 
+ICP_REPORT = {
+    "method": "gicp",
+    "tried": {"ground": {"misfit": 0.52, "ties": 14}, "near": {"misfit": 0.31, "ties": 15}},
+    "chosen": "near",
+    "followed": True,
+    "lost_ties": False,
+    "rounds": [
+        {"reach_m": reach, "iterations": 9, "inliers": 800, "converged": True} for reach in (1.0, 0.5)
+    ],
+}
 ORIGIN = np.array([367_000.0, 5_820_000.0, 30.0])
 YAW = np.deg2rad(33.0)
 SHIFT = np.array([12.5, -7.25, 1.5])
@@ -155,7 +165,7 @@ def make_pair(
     pair = pair.with_(
         T_target_source=T_work,
         solve_report={"iterations": 4},
-        refine_report={"method": "gicp", "rmse_m": 0.07},
+        refine_report={"icp": ICP_REPORT},
     )
     if state == "solved":
         return pair

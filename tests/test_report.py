@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 import cv2
 import numpy as np
 import pytest
-from helpers_scene import make_pair, rasterise
+from helpers_scene import ICP_REPORT, make_pair, rasterise
 
 from mtpcr_geo import draw
 from mtpcr_geo.errors import OutputError
@@ -223,3 +223,14 @@ def test_metrics_are_told_with_their_units():
         "overlap": "4,728 m²", "sigma yaw": "0.02°", "inlier share": "50.0 %", "unknown": "not known",
         "n": "3", "shift": "1.000, 2.000, 3.000 m", "good": "yes", "folds: plan": "0.123 m",
     }  # fmt: skip
+
+
+def test_report_says_which_refinement_was_taken_and_why() -> None:
+    followed = story.refinement_text(ICP_REPORT)
+    assert "gicp" in followed
+    assert "reaches of 1, 0.5 m" in followed
+    assert "0.31" in followed
+    kept = {**ICP_REPORT, "chosen": "ground", "followed": False}
+    assert "surfaces met worse" in story.refinement_text(kept)
+    assert "lost the ties" in story.refinement_text({**kept, "lost_ties": True})
+    assert ("refined by", followed) in story.transform_rows(make_pair(500))

@@ -87,7 +87,21 @@ def transform_rows(pair: Pair) -> list[Row]:
             off = misfits(pair)[inlier]
             plan, height = np.median(np.hypot(off[:, 0], off[:, 1])), np.median(np.abs(off[:, 2]))
             rows.append(("misfit of those", f"median {plan:.2f} m in plan, {height:.2f} m in height"))
+    icp = pair.refine_report.get("icp")
+    if icp:
+        rows.append(("refined by", refinement_text(icp)))
     return rows
+
+
+def refinement_text(icp: Mapping[str, Any]) -> str:
+    """Say which of the refinements was taken, from the report of `mtpcr_geo.refine.follow_icp`."""
+    misfit = icp["tried"][icp["chosen"]]["misfit"]
+    if icp["followed"]:
+        rounds = ", ".join(f"{one['reach_m']:g}" for one in icp["rounds"])
+        return f"ICP ({icp['method']}) with reaches of {rounds} m; surface misfit {misfit:.2f}"
+    why = "ICP lost the ties" if icp["lost_ties"] else "after ICP surfaces met worse"
+    kept = {"ties": "the ties alone", "ground": "ties and ground"}[icp["chosen"]]
+    return f"{kept}: {why}; surface misfit {misfit:.2f}"
 
 
 def units_text(link: FrameLink) -> str:
