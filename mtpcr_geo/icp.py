@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -17,7 +16,6 @@ from mtpcr_geo.shape import local_shapes
 from mtpcr_geo.thinning import near, thinned
 
 Floats = NDArray[np.float64]
-Numbers = NDArray[np.int64]
 Method = Literal["gicp", "point_to_plane", "point_to_point"]
 
 _SMALL_GICP_NAMES = {"gicp": "GICP", "point_to_plane": "PLANE_ICP", "point_to_point": "ICP"}
@@ -36,6 +34,22 @@ FLAT = 4.0
 JUDGES = 10_000
 MEETS_M = 0.1
 """Gap between surfaces at which half the cost is reached that surfaces bear which do not meet at all."""
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """How a run of ICP goes about it.
+
+    Attributes:
+        reach_m: farthest correspondence of each round, metres.
+        trim_m: distance within which a point of the source must have a partner at the start to take part in
+            all rounds but the last, metres; None takes all. What grew or was built between the surveys is left
+            out by it; the last round takes all, so that the result does not hang on the start.
+
+    """
+
+    reach_m: tuple[float, ...]
+    trim_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -61,7 +75,6 @@ class Surfaces:
         voxel_m: thinning, metres.
         reach_m: farthest correspondence to be asked for, metres.
         most_points: of the source after thinning; the target, which costs less, may have three times as many.
-        shared: numbers of both clouds' points in the overlap, if at hand; see `shared_points`.
         threads: for thinning and surfaces.
 
     Raises:
@@ -78,14 +91,15 @@ class Surfaces:
         voxel_m: float = 0.5,
         reach_m: float = FAR_REACH_M[0],
         most_points: int = 30_000,
-        shared: tuple[Numbers, Numbers] | None = None,
         threads: int = 2,
     ) -> None:
         import small_gicp
 
-        of_source, of_target = shared or shared_points(source, target, T_start)
+        moved = geometry.apply(T_start, source)
+        overlap = overlap_of(moved, target)
+        of_source, of_target = (np.flatnonzero(overlap.select(xyz)) for xyz in (moved, target))
         if min(len(of_source), len(of_target)) >= FEWEST_POINTS:
-            s, t = geometry.apply(T_start, source[of_source]), target[of_target]
+            s, t = moved[of_source], target[of_target]
             of_source, of_target = of_source[near(s, t, reach_m)], of_target[near(t, s, reach_m)]
         if min(len(of_source), len(of_target)) < FEWEST_POINTS:
             raise RegistrationError(
@@ -101,10 +115,8 @@ class Surfaces:
         t = thinned(target[of_target], of_target, voxel_m, 3 * most_points)
         self._s, self._t = s - self._pivot, t - self._pivot
         self._source, self._target = small_gicp.PointCloud(self._s), small_gicp.PointCloud(self._t)
-        self._tree = small_gicp.KdTree(self._target, threads)
-        self._source_tree = small_gicp.KdTree(self._source, threads)
-        small_gicp.estimate_normals_covariances(self._source, self._source_tree, NEIGHBOURS, threads)
-        small_gicp.estimate_normals_covariances(self._target, self._tree, NEIGHBOURS, threads)
+        self._source_tree = self._with_surfaces(self._source)
+        self._tree = self._with_surfaces(self._target)
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -112,7 +124,7 @@ class Surfaces:
         return len(self._s), len(self._t)
 
     def descend(
-        self, T_from: Floats, *, reach_m: Sequence[float], method: Method = "gicp", iterations: int = 30
+        self, T_from: Floats, rounds: Rounds, *, method: Method = "gicp", iterations: int = 30
     ) -> Descent:
         """Run ICP from a transform, in rounds of given reach.
 
@@ -120,20 +132,22 @@ class Surfaces:
 
         Args:
             T_from: 4x4 from source to target, work coordinates.
-            reach_m: farthest correspondence of each round, metres.
+            rounds: reach of each round, and which points take part.
             method: "gicp" (plane to plane), "point_to_plane", or "point_to_point" (the paper's citation).
             iterations: at most, each round.
 
         """
         import small_gicp
 
-        X, rounds = self._relative(T_from), []
-        for reach in reach_m:
+        X, told = self._relative(T_from), []
+        trimmed = self._source if rounds.trim_m is None else self._trimmed(X, rounds.trim_m)
+        for number, reach in enumerate(rounds.reach_m, 1):
             # what a round leaves is taken up by the next; only the last must stand still
-            patience = 1.0 if reach == reach_m[-1] else 25.0
+            last = number == len(rounds.reach_m)
+            patience = 1.0 if last else 25.0
             result = small_gicp.align(
                 self._target,
-                self._source,
+                self._source if last else trimmed,
                 self._tree,
                 X,
                 registration_type=_SMALL_GICP_NAMES[method],
@@ -144,7 +158,7 @@ class Surfaces:
                 translation_epsilon=patience * STILL_M,
             )
             X = np.array(result.T_target_source)
-            rounds.append(
+            told.append(
                 {
                     "reach_m": reach,
                     "iterations": int(result.iterations),
@@ -154,7 +168,7 @@ class Surfaces:
             )
         X[:3, :3] = geometry.orthonormal(X[:3, :3])
         T = geometry.translation(self._pivot) @ X @ geometry.translation(-self._pivot) @ self.T_start
-        return Descent(T, rounds)
+        return Descent(T, told)
 
     def misfit(self, T: Floats) -> float:
         """Tell how badly flat surfaces of the source meet the target: 0 all meet, 1 none does.
@@ -176,6 +190,26 @@ class Surfaces:
         gap = np.einsum("ij,ij->i", normal, self._t[nearest] - moved)
         return float((gap**2 / (gap**2 + MEETS_M**2)).mean())
 
+    def _with_surfaces(self, cloud: Any) -> Any:
+        """Find a cloud's normals and covariances, which are stored in it, and give its tree."""
+        import small_gicp
+
+        tree = small_gicp.KdTree(cloud, self._threads)
+        small_gicp.estimate_normals_covariances(cloud, tree, NEIGHBOURS, self._threads)
+        return tree
+
+    def _trimmed(self, X: Floats, within_m: float) -> Any:
+        """Give the source's points that have a partner near by; all, where those are too few."""
+        import small_gicp
+
+        squared = np.asarray(self._tree.batch_knn_search(geometry.apply(X, self._s), 1, self._threads)[1])
+        kept = squared[:, 0] <= within_m**2
+        if kept.sum() < FEWEST_POINTS:
+            return self._source
+        cloud = small_gicp.PointCloud(self._s[kept])
+        self._with_surfaces(cloud)
+        return cloud
+
     @cached_property
     def _judges(self) -> tuple[Floats, Floats]:
         """Flat places of the source, (n, 3), and their unit normals, (n, 3)."""
@@ -190,20 +224,11 @@ class Surfaces:
         return geometry.translation(-self._pivot) @ left @ geometry.translation(self._pivot)
 
 
-def shared_points(source: Floats, target: Floats, T: Floats) -> tuple[Numbers, Numbers]:
-    """Give the numbers of the source's points, (n,), and the target's, (m,), in the overlap under ``T``."""
-    moved = geometry.apply(T, source)
-    overlap = overlap_of(moved, target)
-    return np.flatnonzero(overlap.select(moved)), np.flatnonzero(overlap.select(target))
+def rounds_for(cell: float) -> dict[str, Rounds]:
+    """Name the runs of ICP to try on clouds rasterised at ``cell`` metres: from far, and from near.
 
-
-def reaches_for(cell: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Choose the reaches of ICP's rounds, metres, for clouds rasterised at ``cell`` metres.
-
-    Returns:
-        The far rounds, for starts that are off by metres, and the near ones, which end every descent.
-
+    Those from far catch starts that are off by metres. Both end in the same rounds.
     """
     scale = max(1.0, cell / FINE_CELL_M)
     far, close = (tuple(scale * reach for reach in reaches) for reaches in (FAR_REACH_M, NEAR_REACH_M))
-    return far, close
+    return {"far": Rounds((*far, *close)), "near": Rounds((*close, close[-1]), trim_m=close[0])}

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo import geometry
-from mtpcr_geo.icp import Descent, Method, Surfaces
+from mtpcr_geo.icp import Descent, Method, Rounds, Surfaces
 from mtpcr_geo.overlap import Overlap, overlap_of
 
 Floats = NDArray[np.float64]
@@ -38,10 +38,10 @@ class Refinement:
 
 
 def follow_icp(
-    surfaces: dict[str, Surfaces],
+    surfaces: Surfaces,
     starts: dict[str, Floats],
     *,
-    reaches: dict[str, tuple[float, ...]],
+    rounds: dict[str, Rounds],
     agreeing: Callable[[Floats], int],
     keep_ties: float,
     method: Method = "gicp",
@@ -57,7 +57,7 @@ def follow_icp(
     Args:
         surfaces: of both clouds.
         starts: 4x4 from source to target work coordinates by name; ICP starts from the last.
-        reaches: rounds of each run of ICP, metres, by name.
+        rounds: the runs of ICP to try, by name.
         agreeing: counts the ties that a transform brings together.
         keep_ties: share of the ties agreeing at the last start that must still agree; 0 follows ICP always.
         method: of `Surfaces.descend`.
@@ -66,24 +66,23 @@ def follow_icp(
     """
     *_, last = starts
     runs = {
-        name: surfaces[name].descend(starts[last], reach_m=rounds, method=method, iterations=iterations)
-        for name, rounds in reaches.items()
+        name: surfaces.descend(starts[last], one, method=method, iterations=iterations)
+        for name, one in rounds.items()
     }
     tried = {name: T for name, T in starts.items() if keep_ties > 0} | {
         name: run.T for name, run in runs.items()
     }
     wanted = keep_ties * agreeing(starts[last])
-    judge = next(iter(surfaces.values()))
-    misfit = {name: judge.misfit(T) for name, T in tried.items()}
+    misfit = {name: surfaces.misfit(T) for name, T in tried.items()}
     ties = {name: agreeing(T) for name, T in tried.items()}
     kept = [name for name in tried if name == last or ties[name] >= wanted]
     best = min(kept, key=misfit.__getitem__)
     lost = [name for name in runs if name not in kept and misfit[name] < misfit[best]]
     report = {
         "method": method,
-        "voxel_m": judge.voxel_m,
-        "points_source": judge.sizes[0],
-        "points_target": judge.sizes[1],
+        "voxel_m": surfaces.voxel_m,
+        "points_source": surfaces.sizes[0],
+        "points_target": surfaces.sizes[1],
         "tried": {name: {"misfit": misfit[name], "ties": ties[name]} for name in tried},
         "chosen": best,
         "followed": best in runs,

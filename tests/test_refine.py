@@ -2,13 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers_scene import houses
+from helpers_scene import houses, make_pair
 
 from mtpcr_geo import geometry
 from mtpcr_geo.errors import RegistrationError
 from mtpcr_geo.evaluate.steps import follow, level_pair
-from mtpcr_geo.evidence import ties_agreeing
-from mtpcr_geo.icp import FAR_REACH_M, NEAR_REACH_M, Method, Surfaces, reaches_for
+from mtpcr_geo.evidence import gather, ties_agreeing
+from mtpcr_geo.icp import FAR_REACH_M, NEAR_REACH_M, Method, Rounds, Surfaces, rounds_for
 from mtpcr_geo.overlap import overlap_of
 from mtpcr_geo.refine import follow_icp, settle_on_ground
 from mtpcr_geo.scene import Ties
@@ -25,7 +25,7 @@ def off_by(yaw_deg: float, shift: tuple[float, float, float]) -> np.ndarray:
 
 
 def icp(source: np.ndarray, target: np.ndarray, T_start: np.ndarray, method: Method = "gicp") -> np.ndarray:
-    return Surfaces(source, target, T_start).descend(T_start, reach_m=(3.0, 1.5, 0.75), method=method).T
+    return Surfaces(source, target, T_start).descend(T_start, Rounds((3.0, 1.5, 0.75)), method=method).T
 
 
 @pytest.mark.parametrize(
@@ -84,12 +84,13 @@ def test_overlap_is_what_both_fill() -> None:
     assert overlap.select(a).mean() == pytest.approx(0.4, abs=0.05)
 
 
-def test_reaches_grow_with_coarse_cells() -> None:
-    assert reaches_for(1.0) == reaches_for(2.0) == (FAR_REACH_M, NEAR_REACH_M)
-    assert reaches_for(4.0) == (
-        tuple(2 * reach for reach in FAR_REACH_M),
-        tuple(2 * reach for reach in NEAR_REACH_M),
-    )
+def test_reaches_grow_with_coarse_cells_and_end_alike() -> None:
+    assert rounds_for(1.0) == rounds_for(2.0)
+    fine, coarse = rounds_for(2.0), rounds_for(4.0)
+    assert fine["far"].reach_m == (*FAR_REACH_M, *NEAR_REACH_M)
+    assert fine["near"].reach_m == (*NEAR_REACH_M, NEAR_REACH_M[-1])
+    for name in ("far", "near"):
+        assert coarse[name].reach_m == tuple(2 * reach for reach in fine[name].reach_m)
 
 
 def test_misfit_is_least_where_surfaces_meet_and_goes_with_the_frame(clouds) -> None:
@@ -130,11 +131,11 @@ def test_crops_that_lead_icp_off_the_ground_are_seen_through() -> None:
 
     start = off_by(0.0, (0.05, -0.05, 0.02))
     surfaces = Surfaces(source, target, start)
-    led_off = surfaces.descend(start, reach_m=(*FAR_REACH_M, *NEAR_REACH_M)).T
+    led_off = surfaces.descend(start, rounds_for(1.0)["far"]).T
     found = follow_icp(
-        {"far": surfaces},
+        surfaces,
         {"ties": start},
-        reaches={"far": (*FAR_REACH_M, *NEAR_REACH_M)},
+        rounds=rounds_for(1.0),
         agreeing=lambda T: 10,
         keep_ties=0.5,
     )
@@ -164,3 +165,14 @@ def test_icp_that_loses_the_ties_is_followed_only_where_that_is_asked(clouds, ke
     assert ties_agreeing(refined, refined.T_target_source) == (0 if followed else 60)
     plan = np.linalg.norm(refined.T_target_source[:2, 3])
     assert plan < 0.05 if followed else plan == pytest.approx(np.hypot(2.2, 1.2), abs=0.05)
+
+
+def test_way_from_the_ties_is_measured_in_plan() -> None:
+    # under a degree of tilt levelled heights are off by metres, and coming back from that is no fault
+    pair = make_pair(3000, tilt=4.0)
+    up = geometry.inverse(pair.target.T_level_work)[:3, :3] @ np.array([0.0, 0.0, 2.5])
+    raised = pair.with_(refine_report={"T_before": geometry.translation(-up) @ pair.T_target_source})
+    assert gather(raised)[0].refined_away_m < 1e-9
+    aside = geometry.inverse(pair.target.T_level_work)[:3, :3] @ np.array([1.5, -2.0, 0.0])
+    moved = pair.with_(refine_report={"T_before": geometry.translation(-aside) @ pair.T_target_source})
+    assert gather(moved)[0].refined_away_m == pytest.approx(2.5)

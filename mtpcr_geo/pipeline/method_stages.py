@@ -206,7 +206,7 @@ class Refine(Stage):
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Refine the solved transform."""
         from mtpcr_geo.evidence import ties_agreeing
-        from mtpcr_geo.icp import Surfaces, reaches_for, shared_points
+        from mtpcr_geo.icp import Rounds, Surfaces, rounds_for
         from mtpcr_geo.refine import beyond_scatter, constrain, follow_icp, settle_on_ground
 
         pair = self.one_pair(inputs)
@@ -220,26 +220,20 @@ class Refine(Stage):
             T, report["ground_before"] = settled.T, settled.report
             starts["ground"] = T
         if self.options.method != "none":
-            far, near = reaches_for(pair.cell)
-            asked = self.options.reach
-            reaches = {"asked": tuple(asked)} if asked else {"far": (*far, *near), "near": near}
-            shared = shared_points(source, target, T)
-            surfaces = {
-                name: Surfaces(
-                    source,
-                    target,
-                    T,
-                    voxel_m=self.options.voxel,
-                    reach_m=max(rounds),
-                    most_points=self.options.max_points,
-                    shared=shared,
-                )
-                for name, rounds in reaches.items()
-            }
+            reach = self.options.reach
+            rounds = {"asked": Rounds(tuple(reach))} if reach else rounds_for(pair.cell)
+            surfaces = Surfaces(
+                source,
+                target,
+                T,
+                voxel_m=self.options.voxel,
+                reach_m=max(max(one.reach_m) for one in rounds.values()),
+                most_points=self.options.max_points,
+            )
             refined = follow_icp(
                 surfaces,
                 starts,
-                reaches=reaches,
+                rounds=rounds,
                 agreeing=lambda T: ties_agreeing(pair, T),
                 keep_ties=self.options.keep_ties,
                 method=self.options.method,
