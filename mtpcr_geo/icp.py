@@ -43,7 +43,7 @@ class Rounds:
     Attributes:
         reach_m: farthest correspondence of each round, metres.
         trim_m: distance within which a point of the source must have a partner at the start to take part in
-            all rounds but the last, metres; None takes all. What grew or was built between the surveys is left
+            all rounds but the last, metres; None takes all. What grew or was built in between is left
             out by it; the last round takes all, so that the result does not hang on the start.
 
     """
