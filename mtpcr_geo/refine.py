@@ -21,6 +21,9 @@ CORRELATED_CELLS = 50
 GROUND_NOISE_M = 0.5
 LEVEL_SIGMA_DEG = 1.0
 SCATTER_SHARE, SCATTER_M = 0.5, 0.03
+CLEARLY = 1.01
+"""Times that the misfit after ICP must exceed a start's for the start to be taken: on bare, sparse ground
+they are equal but for chance, and results would jump with it."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ def follow_icp(
     misfit = {name: surfaces.misfit(T) for name, T in tried.items()}
     ties = {name: agreeing(T) for name, T in tried.items()}
     kept = [name for name in tried if name == last or ties[name] >= wanted]
-    best = min(kept, key=misfit.__getitem__)
+    best = min(kept, key=lambda name: misfit[name] * (1.0 if name in runs else CLEARLY))
     lost = [name for name in runs if name not in kept and misfit[name] < misfit[best]]
     report = {
         "method": method,
