@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from mtpcr_geo import geometry
-from mtpcr_geo.errors import MtpcrError
-from mtpcr_geo.evaluate import metrics
-from mtpcr_geo.evaluate.pairs import BenchmarkPair, load_pair, pair_folders
-from mtpcr_geo.evaluate.steps import follow, level_pair, random_start, steps_of
+from mtpcr_geo.benchmark import metrics
+from mtpcr_geo.benchmark.pairs import BenchmarkPair, load_pair, pair_folders
+from mtpcr_geo.benchmark.steps import follow, level_pair, random_start, steps_of
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.errors import MtpcrError
 
 
 def main() -> None:
@@ -55,8 +55,8 @@ def ablated(pair: BenchmarkPair, options: argparse.Namespace) -> str:
     centroid = pair.source.mean(axis=0)
     for _ in range(options.starts):
         T_moved = random_start(rng, centroid, yaw_deg=90.0)
-        levelled = level_pair(geometry.apply(T_moved, pair.source), pair.target, "none")
-        T_true = geometry.inverse(T_moved)
+        levelled = level_pair(transforms.apply(T_moved, pair.source), pair.target, "none")
+        T_true = transforms.inverse(T_moved)
         for res, focus, enhance in itertools.product((True, False), repeat=3):
             steps = steps_of(
                 profile="paper",

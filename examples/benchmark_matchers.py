@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from mtpcr_geo import geometry
-from mtpcr_geo.errors import MtpcrError
-from mtpcr_geo.evaluate import metrics
-from mtpcr_geo.evaluate.pairs import load_pair, pair_folders
-from mtpcr_geo.evaluate.steps import follow, level_pair, random_start, steps_of
+from mtpcr_geo.benchmark import metrics
+from mtpcr_geo.benchmark.pairs import load_pair, pair_folders
+from mtpcr_geo.benchmark.steps import follow, level_pair, random_start, steps_of
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.errors import MtpcrError
 
 FIELDS = (
     "pair", "seed", "tilt_deg", "start", "matcher", "image", "verdict", "right", "rotation_deg", "distance_m",
@@ -120,7 +120,7 @@ def runs(
             left = [variant for key, variant in zip(keys, variants(options), strict=True) if key not in done]
             if not left:
                 continue
-            moved = geometry.apply(T_moved, pair.source)
+            moved = transforms.apply(T_moved, pair.source)
             levelled = level_pair(moved, other.target, "auto" if options.tilt else "none")
             rasters: dict[str, Any] = {}
             for matcher, look in left:
@@ -142,9 +142,9 @@ def runs(
                     "why": outcome.failure or "; ".join(outcome.pair.verdict.reasons),
                 }  # fmt: skip
                 if T is not None and other is pair:
-                    T_true = geometry.inverse(T_moved)
+                    T_true = transforms.inverse(T_moved)
                     plan, height = metrics.centroid_errors(
-                        T, T_true, geometry.apply(T_moved, centroid[None])[0]
+                        T, T_true, transforms.apply(T_moved, centroid[None])[0]
                     )
                     row["rotation_deg"] = metrics.rotation_error_deg(T, T_true)
                     row["distance_m"] = float(np.hypot(plan, height))

@@ -27,8 +27,8 @@ from typing import Any
 import laspy
 import numpy as np
 
-from mtpcr_geo import geometry
-from mtpcr_geo.evaluate import metrics
+from mtpcr_geo.benchmark import metrics
+from mtpcr_geo.core import transforms
 
 FIELDS = (
     "pair", "start", "verdict", "success", "rotation_deg", "plan_m", "height_m", "time_s", "memory_mb",
@@ -88,12 +88,14 @@ def related(folders: list[Path], options: argparse.Namespace) -> Iterator[dict[s
                 if not options.as_is:
                     T_moved = random_start(rng, centroid)
                     moved = Path(scratch) / "source.laz"
-                    write_moved(source, geometry.apply(T_moved, xyz), moved)
+                    write_moved(source, transforms.apply(T_moved, xyz), moved)
                 row = run(moved, folder / "target.laz", crs_options(folder, pair), Path(scratch) / "out")
                 found = row.pop("T_target_source")
                 if found is not None:
                     row |= errors(
-                        found, T_truth @ geometry.inverse(T_moved), geometry.apply(T_moved, centroid[None])[0]
+                        found,
+                        T_truth @ transforms.inverse(T_moved),
+                        transforms.apply(T_moved, centroid[None])[0],
                     )
                 yield {"pair": folder.name, "start": start, **row}
 
@@ -115,8 +117,8 @@ def random_start(rng: np.random.Generator, centroid: np.ndarray) -> np.ndarray:
     """Turn by any yaw about the centroid, and move by up to 100 m in any direction."""
     direction = rng.normal(size=3)
     shift = direction / np.linalg.norm(direction) * rng.uniform(0.0, 100.0)
-    return geometry.translation(shift) @ geometry.about(
-        centroid, geometry.yaw_matrix(rng.uniform(0, 2 * np.pi))
+    return transforms.translation(shift) @ transforms.about(
+        centroid, transforms.yaw_matrix(rng.uniform(0, 2 * np.pi))
     )
 
 
@@ -144,7 +146,16 @@ def run(source: Path, target: Path, options: list[str], out: Path) -> dict[str, 
     """Run the command once, and read what it left."""
     for old in out.glob("*.*"):
         old.unlink()
-    command = [sys.executable, "-m", "mtpcr_geo.cli", "register", str(source), str(target), "-o", str(out)]
+    command = [
+        sys.executable,
+        "-m",
+        "mtpcr_geo.cli.app",
+        "register",
+        str(source),
+        str(target),
+        "-o",
+        str(out),
+    ]
     command += ["--overwrite", "--quiet", *options]
     began = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)

@@ -12,10 +12,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtpcr_geo.evaluate.pairs import load_pair, pair_folders
-from mtpcr_geo.evaluate.protocol import RUNS, read_rows
-from mtpcr_geo.evaluate.sim_to_real import cloud_figures, compare, margins
-from mtpcr_geo.evaluate.tables import to_markdown
+from mtpcr_geo.benchmark.pairs import load_pair, pair_folders
+from mtpcr_geo.benchmark.protocol import RUNS, read_rows
+from mtpcr_geo.benchmark.sim_to_real import cloud_figures, compare, margins
+from mtpcr_geo.benchmark.tables import to_markdown
 
 
 def main() -> None:

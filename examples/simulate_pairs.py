@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtpcr_geo.evaluate.simulate import simulate_pair, write_pair
+from mtpcr_geo.benchmark.simulator.pairs import simulate_pair, write_pair
 
 # kind, seed, extent in metres, overlap, tilt in degrees, aerial scanner, its points per square metre
 SITES = [

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mtpcr_geo.api import Pipeline
+    from mtpcr_geo.pipeline.api import Pipeline
 
 __version__ = "0.1.0"
 __all__ = ["Pipeline", "__version__"]
@@ -12,7 +12,7 @@ __all__ = ["Pipeline", "__version__"]
 def __getattr__(name: str) -> Any:
     # imported when asked for, so that importing the package costs nothing
     if name == "Pipeline":
-        from mtpcr_geo.api import Pipeline
+        from mtpcr_geo.pipeline.api import Pipeline
 
         return Pipeline
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,5 +1,5 @@
 """Lets ``python -m mtpcr_geo`` do what ``mtpcr-geo`` does."""
 
-from mtpcr_geo.cli import main
+from mtpcr_geo.cli.app import main
 
 main()

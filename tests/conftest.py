@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
-from mtpcr_geo import geometry
-from mtpcr_geo.cloud.base import ArrayCloud
-from mtpcr_geo.cloud.write import write_cloud
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.cloud import ArrayCloud
+from mtpcr_geo.io.write import write_cloud
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -47,8 +47,8 @@ def town_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("town")
     target = town(rng, 60_000) + ORIGIN
     source = town(rng, 40_000)
-    turn = geometry.compose(geometry.yaw_matrix(np.deg2rad(-61.0)), np.array([14.0, -9.0, 2.5]))
-    source = geometry.apply(turn, source[source[:, 0] > -30.0]) + ORIGIN
+    turn = transforms.compose(transforms.yaw_matrix(np.deg2rad(-61.0)), np.array([14.0, -9.0, 2.5]))
+    source = transforms.apply(turn, source[source[:, 0] > -30.0]) + ORIGIN
     files = []
     for name, xyz in (("source", source), ("target", target)):
         extra = {

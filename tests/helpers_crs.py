@@ -11,18 +11,18 @@ from pyproj import CRS, Transformer
 from pyproj.crs import BoundCRS, CompoundCRS
 from pyproj.crs.coordinate_operation import ToWGS84Transformation
 
-from mtpcr_geo import geometry
-from mtpcr_geo.cloud.base import ArrayCloud
-from mtpcr_geo.cloud.write import write_cloud
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.cloud import ArrayCloud
+from mtpcr_geo.core.types import Pair
 from mtpcr_geo.crs import TransformChain
-from mtpcr_geo.scene import Pair
+from mtpcr_geo.io.write import write_cloud
 
 FOOT, US_FOOT = 0.3048, 1200 / 3937
 UTM = CRS.from_epsg(25832)
 PLACE = np.array([389_000.0, 5_373_000.0, 180.0])  # Alsace: UTM 32, near zone 31, within Lambert-93
 LOCAL_ORIGIN = PLACE - [40.0, 25.0, 3.0]
 STEP = 1e-4  # metres, or the like of it: what a file cannot hold must not decide
-T_MOVED = geometry.compose(geometry.yaw_matrix(np.deg2rad(3.0)), np.array([4.0, -3.0, 1.5]))
+T_MOVED = transforms.compose(transforms.yaw_matrix(np.deg2rad(3.0)), np.array([4.0, -3.0, 1.5]))
 CORNERS = PLACE + np.array([[-30.0, -60, 0], [60, -60, 10], [60, 60, 0], [-30, 60, 5], [0, 0, 0]])
 
 
@@ -130,7 +130,7 @@ def site(points: int = 60_000) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(7)
     target, source = houses(rng, points), houses(rng, 2 * points // 3)
     source = source[source[:, 0] > -30.0]
-    return geometry.apply(T_MOVED, source) + PLACE, target + PLACE
+    return transforms.apply(T_MOVED, source) + PLACE, target + PLACE
 
 
 def options_of(source: Variant, target: Variant) -> dict[str, str]:
@@ -141,7 +141,7 @@ def options_of(source: Variant, target: Variant) -> dict[str, str]:
 
 def moved_corners() -> np.ndarray:
     """Metric coordinates of CORNERS as the source has them."""
-    return geometry.apply(T_MOVED, CORNERS - PLACE) + PLACE
+    return transforms.apply(T_MOVED, CORNERS - PLACE) + PLACE
 
 
 def placed(pair: Pair, source: Variant, target: Variant) -> np.ndarray:

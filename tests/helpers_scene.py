@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from pyproj import CRS
 
-from mtpcr_geo import geometry
-from mtpcr_geo.cloud.base import ArrayCloud
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.cloud import ArrayCloud
+from mtpcr_geo.core.grid import Grid
+from mtpcr_geo.core.types import Bev, Hypothesis, Matches, Pair, Side, Ties, Verdict
 from mtpcr_geo.crs import FrameLink, WorkFrame
-from mtpcr_geo.raster import Grid
-from mtpcr_geo.scene import Bev, Hypothesis, Matches, Pair, Side, Ties, Verdict
 
 ICP_REPORT = {
     "method": "gicp",
@@ -93,7 +93,7 @@ def rasterise(xyz: np.ndarray, cell: float = 1.0) -> Bev:
 
 def true_transform() -> np.ndarray:
     """The 4x4 that takes the helper's source work coordinates to its target work coordinates."""
-    return geometry.compose(geometry.yaw_matrix(YAW), SHIFT)
+    return transforms.compose(transforms.yaw_matrix(YAW), SHIFT)
 
 
 def make_sides(n: int = 20_000, crs: str | None = "EPSG:25833", tilt: float = 0.0, cell: float = 1.0):
@@ -102,9 +102,9 @@ def make_sides(n: int = 20_000, crs: str | None = "EPSG:25833", tilt: float = 0.
     known = CRS(crs) if crs else None
     target_origin = ORIGIN if crs else np.zeros(3)
     target_xyz = town(rng, n)
-    source_xyz = geometry.apply(geometry.inverse(true_transform()), town(rng, n))
-    T_level = geometry.compose(geometry.tilt_matrix(0.4, tilt), np.zeros(3))
-    source_xyz = geometry.apply(geometry.inverse(T_level), source_xyz)
+    source_xyz = transforms.apply(transforms.inverse(true_transform()), town(rng, n))
+    T_level = transforms.compose(transforms.tilt_matrix(0.4, tilt), np.zeros(3))
+    source_xyz = transforms.apply(transforms.inverse(T_level), source_xyz)
     sides = []
     for role, xyz, origin, T in (
         ("target", target_xyz, target_origin, np.eye(4)),
@@ -113,7 +113,7 @@ def make_sides(n: int = 20_000, crs: str | None = "EPSG:25833", tilt: float = 0.
         side_crs = known if role == "target" else None
         link = FrameLink(side_crs, origin)
         cloud = ArrayCloud(link.to_file(xyz), side_crs, f"{role}.laz")
-        bev = rasterise(geometry.apply(T, xyz), cell)
+        bev = rasterise(transforms.apply(T, xyz), cell)
         sides.append(Side(role, cloud, link, xyz, T, {"method": "none" if not tilt else "ransac"}, bev))
     return sides[0], sides[1]
 
@@ -138,7 +138,7 @@ def make_pair(
     target_xyz = town(rng, m, extent=100.0)
     noise = rng.normal(0.0, 0.08, (m, 3))
     noise[:12] += rng.uniform(3.0, 8.0, (12, 3)) * rng.choice([-1, 1], (12, 3))
-    source_xyz = geometry.apply(geometry.inverse(T), target_xyz + noise)
+    source_xyz = transforms.apply(transforms.inverse(T), target_xyz + noise)
     score = rng.uniform(0.3, 1.0, m)
     hypotheses = tuple(
         Hypothesis(float(YAW + k * 0.7), (float(SHIFT[0] + 3 * k), float(SHIFT[1])), s, 9000 - 500 * k)

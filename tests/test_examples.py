@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 
-from mtpcr_geo import geometry
+from mtpcr_geo.core import transforms
 
 
 def run(name: str, *arguments: object, seconds: int = 300) -> str:
@@ -27,10 +27,10 @@ def run(name: str, *arguments: object, seconds: int = 300) -> str:
 @pytest.fixture
 def pairs(town_files: tuple[Path, Path], tmp_path: Path) -> Path:
     """Two folders of one pair each, in the form of the real ones."""
-    T = geometry.compose(geometry.yaw_matrix(np.deg2rad(-61.0)), np.array([14.0, -9.0, 2.5]))
+    T = transforms.compose(transforms.yaw_matrix(np.deg2rad(-61.0)), np.array([14.0, -9.0, 2.5]))
     from helpers_scene import ORIGIN
 
-    T = geometry.translation(ORIGIN) @ geometry.inverse(T) @ geometry.translation(-ORIGIN)
+    T = transforms.translation(ORIGIN) @ transforms.inverse(T) @ transforms.translation(-ORIGIN)
     for name in ("a", "b"):
         folder = tmp_path / "pairs" / name
         folder.mkdir(parents=True)

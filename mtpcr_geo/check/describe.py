@@ -10,8 +10,8 @@ from mtpcr_geo.check.place import code_of, epochs_of
 
 if TYPE_CHECKING:
     from mtpcr_geo.check.preflight import Looked
-    from mtpcr_geo.cloud.las import LasCloud
     from mtpcr_geo.crs import CrsFacts
+    from mtpcr_geo.io.las import LasCloud
 
 
 def describe(looked: Looked) -> dict[str, Any]:

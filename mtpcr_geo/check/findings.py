@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from mtpcr_geo.errors import MtpcrError
+from mtpcr_geo.core.errors import MtpcrError
 
 Severity = Literal["error", "warning", "note"]
 CloudRole = Literal["source", "target"]

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mtpcr_geo.check.findings import Finding, Role, rewrite
-from mtpcr_geo.cloud.vlr import GEOKEYS, WKT_RECORD, crs_of_records
+from mtpcr_geo.io.vlr import GEOKEYS, WKT_RECORD, crs_of_records
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mtpcr_geo.cloud.las import LasCloud
     from mtpcr_geo.crs import CrsFacts
+    from mtpcr_geo.io.las import LasCloud
 
 METRES_A_DEGREE = 111_320.0
 FINEST_SCALE_M = 0.0001
@@ -137,8 +137,8 @@ def _crs_records(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Findin
 
 def _agree(one: object, other: object) -> bool:
     """Compare only what GeoTIFF keys can say: the horizontal part."""
+    from mtpcr_geo.core.errors import CrsError
     from mtpcr_geo.crs import facts_of, same_place
-    from mtpcr_geo.errors import CrsError
 
     try:
         first, second = facts_of(one).horizontal, facts_of(other).horizontal  # type: ignore[arg-type]
@@ -301,7 +301,7 @@ def _times(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Finding]:
 def _first_times(cloud: LasCloud, count: int = 10_000) -> NDArray[np.float64] | None:
     from laspy import DecompressionSelection as Fields
 
-    from mtpcr_geo.errors import InputError
+    from mtpcr_geo.core.errors import InputError
 
     try:
         record = next(iter(cloud.record_chunks(count, Fields.XY_RETURNS_CHANNEL | Fields.GPS_TIME)), None)

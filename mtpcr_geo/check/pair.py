@@ -16,7 +16,7 @@ from mtpcr_geo.crs.resolve import FARTHEST_APART
 if TYPE_CHECKING:
     from mtpcr_geo.check.preflight import Looked
     from mtpcr_geo.crs import FrameLink
-    from mtpcr_geo.overlap import Overlap
+    from mtpcr_geo.method.overlap import Overlap
 
 Floats = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ def relate(source: Floats, target: Floats) -> tuple[Relation, Overlap | None]:
     """
     from scipy.spatial import cKDTree
 
-    from mtpcr_geo.overlap import OVERLAP_CELL_M, overlap_of
+    from mtpcr_geo.method.overlap import OVERLAP_CELL_M, overlap_of
 
     low = np.maximum(source.min(axis=0), target.min(axis=0))[:2]
     high = np.minimum(source.max(axis=0), target.max(axis=0))[:2]
@@ -89,7 +89,7 @@ def by_area(source: Looked, target: Looked) -> Relation:
     """Tell roughly how far apart two clouds are that came to no common frame, from their middles."""
     from pyproj import Geod
 
-    from mtpcr_geo.crs.link import box_points
+    from mtpcr_geo.core.frames import box_points
     from mtpcr_geo.crs.operation import area_of
 
     middles = []
@@ -269,9 +269,9 @@ def swapped_findings(source: Looked, target: Looked) -> Iterator[Finding]:
 
 def _meet(source: Looked, target: Looked, turned: tuple[str, ...]) -> bool:
     """Tell whether the bounds of two clouds come near each other, x and y exchanged in those named."""
-    from mtpcr_geo.cloud.base import ArrayCloud
+    from mtpcr_geo.core.cloud import ArrayCloud
+    from mtpcr_geo.core.errors import MtpcrError
     from mtpcr_geo.crs import resolve_frames
-    from mtpcr_geo.errors import MtpcrError
 
     boxes = [
         ArrayCloud(exchanged(looked.bounds) if looked.role in turned else looked.bounds)

@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.check.findings import Finding, Role
-from mtpcr_geo.cloud.vlr import WKT_RECORD
+from mtpcr_geo.core.errors import CrsError
+from mtpcr_geo.core.frames import box_points
 from mtpcr_geo.crs import CrsFacts, facts_of, parse_crs, same_place
 from mtpcr_geo.crs.facts import unbound
-from mtpcr_geo.crs.link import box_points
 from mtpcr_geo.crs.operation import area_of
-from mtpcr_geo.errors import CrsError
+from mtpcr_geo.io.vlr import WKT_RECORD
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from mtpcr_geo.cloud.las import LasCloud
+    from mtpcr_geo.io.las import LasCloud
 
 Floats = NDArray[np.float64]
 # grids are used a little beyond their area, and neighbouring zones for one another; they do not break there

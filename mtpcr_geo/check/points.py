@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.check.findings import Finding, Role, rewrite
-from mtpcr_geo.cloud.base import CHUNK_POINTS, Cloud, PointTable
+from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 
 if TYPE_CHECKING:
-    from mtpcr_geo.cloud.las import LasCloud
-    from mtpcr_geo.cloud.sample import Scan
+    from mtpcr_geo.io.las import LasCloud
+    from mtpcr_geo.io.sample import Scan
 
 Floats = NDArray[np.float64]
 

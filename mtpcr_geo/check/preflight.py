@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo.bev import Density, choose_cell, density, grid_around
 from mtpcr_geo.check import header, pair, place, points
 from mtpcr_geo.check.describe import describe
 from mtpcr_geo.check.findings import CloudRole, Finding, Role, by_severity, finding_of
-from mtpcr_geo.cloud.las import LasCloud, check_distinct, open_cloud
-from mtpcr_geo.cloud.sample import Scan, scan
+from mtpcr_geo.core.errors import CrsError, InputError, MtpcrError, OptionError, RegistrationError
+from mtpcr_geo.core.frames import box_points
 from mtpcr_geo.crs import FrameLink, WorkFrame, resolve_frames
-from mtpcr_geo.crs.link import box_points
-from mtpcr_geo.errors import CrsError, InputError, MtpcrError, OptionError, RegistrationError
+from mtpcr_geo.io.las import LasCloud, check_distinct, open_cloud
+from mtpcr_geo.io.sample import Scan, scan
+from mtpcr_geo.method.bev import Density, choose_cell, density, grid_around
 
 if TYPE_CHECKING:
     from mtpcr_geo.crs import Vertical
-    from mtpcr_geo.overlap import Overlap
+    from mtpcr_geo.method.overlap import Overlap
     from mtpcr_geo.pipeline.stage import Progress
 
 Floats = NDArray[np.float64]

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo import geometry
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.frames import FrameLink, box_points, fit_affine
 from mtpcr_geo.crs.facts import facts_of
-from mtpcr_geo.crs.link import FrameLink, box_points, fit_affine
 
 if TYPE_CHECKING:
-    from mtpcr_geo.scene import Pair
+    from mtpcr_geo.core.types import Pair
 
 Floats = NDArray[np.float64]
 
@@ -60,11 +60,11 @@ class TransformChain:
 
     def forward(self, xyz: Floats) -> Floats:
         """Take (n, 3) source file coordinates to (n, 3) target file coordinates."""
-        return self.target.to_file(geometry.apply(self.T_target_source, self.source.to_work(xyz)))
+        return self.target.to_file(transforms.apply(self.T_target_source, self.source.to_work(xyz)))
 
     def inverse(self, xyz: Floats) -> Floats:
         """Take (n, 3) target file coordinates to (n, 3) source file coordinates."""
-        return self.source.to_file(geometry.apply(self.T_source_target, self.target.to_work(xyz)))
+        return self.source.to_file(transforms.apply(self.T_source_target, self.target.to_work(xyz)))
 
     @property
     def shift_m(self) -> Floats | None:
@@ -72,7 +72,7 @@ class TransformChain:
         if any(facts_of(link.file_crs).kind == "local" for link in (self.source, self.target)):
             return None
         before = self.source.to_work(self.pivot[None])
-        after = geometry.apply(self.T_target_source, before)
+        after = transforms.apply(self.T_target_source, before)
         return np.asarray((after - before)[0] + (self.target.origin - self.source.origin))
 
     @property
@@ -86,7 +86,7 @@ class TransformChain:
     @property
     def T_source_target(self) -> Floats:
         """4x4 in work coordinates, metres, from target to source."""
-        return geometry.inverse(self.T_target_source)
+        return transforms.inverse(self.T_target_source)
 
     @property
     def is_affine(self) -> bool:
@@ -108,7 +108,7 @@ class TransformChain:
         T = self.T_file
         corners = box_points(self.bounds)
         chained = self.target.to_work(self.forward(corners))
-        direct = self.target.to_work(geometry.apply(T, corners))
+        direct = self.target.to_work(transforms.apply(T, corners))
         return float(np.linalg.norm(chained - direct, axis=1).max())
 
     @property

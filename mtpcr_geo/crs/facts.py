@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
-from mtpcr_geo.errors import CrsError
+from mtpcr_geo.core.errors import CrsError
 
 if TYPE_CHECKING:
     from pyproj import CRS

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo.errors import CrsError
+from mtpcr_geo.core.errors import CrsError
 
 if TYPE_CHECKING:
     from pyproj import CRS

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.core.errors import CrsError, InputError
+from mtpcr_geo.core.frames import FrameLink, WorkFrame, box_points, run_pipeline
 from mtpcr_geo.crs.facts import CrsFacts, facts_of, metric, same_datum, same_heights, same_place, unbound
-from mtpcr_geo.crs.link import FrameLink, WorkFrame, box_points, run_pipeline
 from mtpcr_geo.crs.operation import area_of, best_operation, grid_scale, local_projection
-from mtpcr_geo.errors import CrsError, InputError
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from mtpcr_geo.cloud.base import Cloud
+    from mtpcr_geo.core.cloud import Cloud
 
 Floats = NDArray[np.float64]
 Vertical = Literal["refuse", "assume-same", "estimate"]

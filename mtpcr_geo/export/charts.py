@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo import draw
+from mtpcr_geo.export import drawing
 
 Floats = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ def histogram(residual_m: Floats, inlier: NDArray[np.bool_], limit_m: float, bin
     parts = []
     for i, (g, b) in enumerate(zip(good, bad, strict=True)):
         y = float(base)
-        for number, colour in ((g, draw.GOOD_RGB), (b, draw.BAD_RGB)):
+        for number, colour in ((g, drawing.GOOD_RGB), (b, drawing.BAD_RGB)):
             size = (base - 12) * float(number) / top
             y -= size
             if number:
@@ -102,7 +102,7 @@ def misfit_map(
 
     parts = []
     for role, ring in rings.items():
-        colour = draw.SOURCE_RGB if role == "source" else draw.TARGET_RGB
+        colour = drawing.SOURCE_RGB if role == "source" else drawing.TARGET_RGB
         points = " ".join(f"{x:.1f},{y:.1f}" for x, y in place(ring))
         parts.append(f'<polyline points="{points}" fill="none" stroke="{_css(colour)}" stroke-width="1.5"/>')
     misfit = registered[:, :2] - target[:, :2]

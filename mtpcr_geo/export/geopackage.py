@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo.errors import OutputError
+from mtpcr_geo.core.errors import OutputError
 
 if TYPE_CHECKING:
     from pyproj import CRS

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo import geometry
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.errors import InputError
+from mtpcr_geo.core.frames import FrameLink
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.crs.facts import facts_of
-from mtpcr_geo.crs.link import FrameLink
-from mtpcr_geo.errors import InputError
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from mtpcr_geo.scene import Pair
+    from mtpcr_geo.core.types import Pair
 
 Floats = NDArray[np.float64]
 KIND, VERSION = "mtpcr-geo transform", 1
@@ -43,7 +43,7 @@ def write_transform_json(path: str | Path, pair: Pair) -> None:
         "type": KIND,
         "version": VERSION,
         "T_target_source": T,
-        "T_source_target": np.linalg.inv(T) if not _is_rigid(T) else geometry.inverse(T),
+        "T_source_target": np.linalg.inv(T) if not _is_rigid(T) else transforms.inverse(T),
         "frame": "coordinates as they stand in the files: T takes those of the source to the target's",
         "exactness": {
             "exact": chain.is_affine,
@@ -78,7 +78,7 @@ def write_transform_json(path: str | Path, pair: Pair) -> None:
             "source": examples[0],
             "target": moved[0],
             "source_again": chain.inverse(moved[:1])[0],
-            "by_matrix": geometry.apply(T, examples[:1])[0],
+            "by_matrix": transforms.apply(T, examples[:1])[0],
         },
         "more_examples": [{"source": a, "target": b} for a, b in zip(examples[1:], moved[1:], strict=True)],
         "cloudcompare": {key: value for key, value in _cloudcompare(chain).items() if key != "matrix"},
@@ -106,12 +106,12 @@ def write_pdal_pipeline(path: str | Path, pair: Pair) -> None:
     if chain.is_affine:
         stages.append({"type": "filters.transformation", "matrix": _row_major(chain.T_file)})
     else:
-        inner = geometry.translation(chain.target.origin) @ chain.T_target_source
+        inner = transforms.translation(chain.target.origin) @ chain.T_target_source
         stages += _pdal_link(chain.source, inverse=False)
         stages.append(
             {
                 "type": "filters.transformation",
-                "matrix": _row_major(inner @ geometry.translation(-chain.source.origin)),
+                "matrix": _row_major(inner @ transforms.translation(-chain.source.origin)),
             }
         )
         stages += _pdal_link(chain.target, inverse=True)
@@ -228,8 +228,8 @@ def _examples(pair: Pair, chain: TransformChain) -> Floats:
 def _motion(chain: TransformChain) -> dict[str, Any]:
     R = chain.T_target_source[:3, :3]
     motion: dict[str, Any] = {
-        "rotation_deg": float(np.degrees(geometry.rotation_angle(R))),
-        "yaw_deg": float(np.degrees(geometry.yaw_of(R))),
+        "rotation_deg": float(np.degrees(transforms.rotation_angle(R))),
+        "yaw_deg": float(np.degrees(transforms.yaw_of(R))),
         "tilt_deg": float(np.degrees(np.arctan2(np.hypot(R[0, 2], R[1, 2]), R[2, 2]))),
         "note": "in the work frame; yaw counter-clockwise seen from above",
     }
@@ -305,7 +305,7 @@ def _cloudcompare(chain: TransformChain) -> dict[str, Any]:
     source, target = _file_origin(chain.source), _file_origin(chain.target)
     if np.abs(source - target).max() < _SHARED_SHIFT:
         source = target
-    T = geometry.translation(-target) @ chain.T_file @ geometry.translation(source)
+    T = transforms.translation(-target) @ chain.T_file @ transforms.translation(source)
     # the sums above cancel at far origins; the pivot's image is known to full precision
     T[:3, 3] = (chain.forward(chain.pivot[None])[0] - target) - T[:3, :3] @ (chain.pivot - source)
     same = bool((source == target).all())

@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo.raster import Grid
-from mtpcr_geo.scene import Bev, Matches
+from mtpcr_geo.core.grid import Grid
+from mtpcr_geo.core.types import Bev, Matches
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.uint8]

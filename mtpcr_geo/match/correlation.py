@@ -13,16 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo import geometry
-from mtpcr_geo.bev import coarsen
-from mtpcr_geo.chance import chance_within, surprise
-from mtpcr_geo.enhance import channels
-from mtpcr_geo.errors import RegistrationError
-from mtpcr_geo.match.local import PatchMatches, match_patches
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.errors import RegistrationError
+from mtpcr_geo.core.statistics import chance_within, surprise
+from mtpcr_geo.core.types import Bev, Hypothesis, Matches
+from mtpcr_geo.match.patches import PatchMatches, match_patches
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.search import GlobalSearch, Layer, angle_between, distinct, score_nearby
-from mtpcr_geo.scene import Bev, Hypothesis, Matches
-from mtpcr_geo.solve import iterative_svd, ransac_upright
+from mtpcr_geo.method.bev import coarsen
+from mtpcr_geo.method.images import channels
+from mtpcr_geo.method.solve import iterative_svd, ransac_upright
 
 Floats = NDArray[np.float64]
 
@@ -346,7 +346,7 @@ def _corrected(
         floor=AGREE_CELLS * source.grid.cell,
         upright=True,
     )
-    east, north = geometry.apply(solution.T, np.array([[*centre_of(source.grid), 0.0]]))[0, :2]
+    east, north = transforms.apply(solution.T, np.array([[*centre_of(source.grid), 0.0]]))[0, :2]
     return Pose(
-        geometry.yaw_of(solution.T[:3, :3]), float(east), float(north), pose.score, pose.overlap_cells
+        transforms.yaw_of(solution.T[:3, :3]), float(east), float(north), pose.score, pose.overlap_cells
     )

@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo import geometry
-from mtpcr_geo.errors import RegistrationError
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.errors import RegistrationError
+from mtpcr_geo.core.grid import Grid
+from mtpcr_geo.core.types import Hypothesis, Matches
 from mtpcr_geo.match.base import Advance, Grey, ImageMatcher, PixelMatches, View, one_to_one
 from mtpcr_geo.match.search import angle_between
-from mtpcr_geo.raster import Grid
-from mtpcr_geo.scene import Hypothesis, Matches
-from mtpcr_geo.solve import ransac_upright
+from mtpcr_geo.method.solve import ransac_upright
 
 Floats = NDArray[np.float64]
 
@@ -249,7 +249,7 @@ def _hypotheses(tried: list[Orientation]) -> tuple[Hypothesis, ...]:
     poses = [(one.count, one.T) for one in tried] + [(one.rival_count, one.rival) for one in tried]
     kept: list[Hypothesis] = []
     for count, T in sorted(poses, key=lambda pose: -pose[0]):
-        yaw = geometry.yaw_of(T[:3, :3])
+        yaw = transforms.yaw_of(T[:3, :3])
         shift = (float(T[0, 3]), float(T[1, 3]))
         alike = any(
             angle_between(yaw, other.yaw) < np.radians(5.0)

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo.raster import Grid
-from mtpcr_geo.scene import Hypothesis
+from mtpcr_geo.core.grid import Grid
+from mtpcr_geo.core.types import Hypothesis
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo.enhance import Channels
+from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.match.pose import Pose, centre_of, warp_to
-from mtpcr_geo.raster import Grid
+from mtpcr_geo.method.images import Channels
 
 Image = NDArray[np.float32]
 

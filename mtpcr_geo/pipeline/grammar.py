@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mtpcr_geo.errors import OptionError
-from mtpcr_geo.pipeline.words import meant
+from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.suggestions import meant
 
 _TAG = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 _GLOB = re.compile(r"[*?\[]")

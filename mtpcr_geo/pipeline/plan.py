@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import ValidationError
 
-from mtpcr_geo.errors import MissingPartError, OptionError
-from mtpcr_geo.pipeline import pdal_library, safety
+from mtpcr_geo.core.errors import MissingPartError, OptionError
+from mtpcr_geo.pipeline import safety
 from mtpcr_geo.pipeline.grammar import StageSpec, file_of
+from mtpcr_geo.pipeline.pdal import library
 from mtpcr_geo.pipeline.registry import make_options, stage_types, unknown_type
 from mtpcr_geo.pipeline.stage import Stage
 
@@ -35,7 +36,7 @@ def plan(specs: Sequence[StageSpec], settings: Settings) -> dict[str, Stage]:
     stages: dict[str, Stage] = {}
     for spec in specs:
         if spec.tag in by_pdal:
-            from mtpcr_geo.pipeline.pdal_stages import make_pdal_stage
+            from mtpcr_geo.pipeline.pdal.stages import make_pdal_stage
 
             stages[spec.tag] = make_pdal_stage(spec)
         else:
@@ -77,15 +78,15 @@ def _needs_pdal(spec: StageSpec) -> bool:
     own = stage_types()
     if not spec.type.startswith(_PDAL_FAMILIES):
         if spec.type not in own:
-            known = [*own, *pdal_library.drivers()] if pdal_library.available() else list(own)
+            known = [*own, *library.drivers()] if library.available() else list(own)
             raise unknown_type(spec.label, spec.type, known)
         return False
     if spec.type in own:
         return not _we_can(spec) and _pdal_has(spec)
-    if not pdal_library.available():
-        raise MissingPartError(f"{spec.label} needs PDAL, which is not installed; {pdal_library.INSTALL}")
+    if not library.available():
+        raise MissingPartError(f"{spec.label} needs PDAL, which is not installed; {library.INSTALL}")
     if not _pdal_has(spec):
-        raise unknown_type(spec.label, spec.type, [*own, *pdal_library.drivers()])
+        raise unknown_type(spec.label, spec.type, [*own, *library.drivers()])
     return True
 
 
@@ -99,12 +100,12 @@ def _we_can(spec: StageSpec) -> bool:
 
 
 def _pdal_has(spec: StageSpec) -> bool:
-    return pdal_library.available() and spec.type in pdal_library.drivers()
+    return library.available() and spec.type in library.drivers()
 
 
 def _connect(specs: Sequence[StageSpec], stages: Mapping[str, Stage]) -> None:
     """Tell every PDAL stage what stands before it, and whether PDAL must run once it is reached."""
-    from mtpcr_geo.pipeline.pdal_stages import PdalStage
+    from mtpcr_geo.pipeline.pdal.stages import PdalStage
 
     files: dict[str, Path | None] = {}
     for spec in specs:

@@ -10,11 +10,11 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from mtpcr_geo.errors import OptionError
+from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.suggestions import meant
 from mtpcr_geo.pipeline.stage import Stage, StageOptions
-from mtpcr_geo.pipeline.words import meant
 
-_MODULES = ("io_stages", "frame_stages", "matcher_stages", "method_stages", "export_stages", "composite")
+_MODULES = ("io", "rasters", "matching", "solving", "export", "register")
 
 
 @cache
@@ -22,7 +22,7 @@ def stage_types() -> dict[str, type[Stage]]:
     """Give every stage the package serves itself, by type, in the order of a run."""
     found: dict[str, type[Stage]] = {}
     for name in _MODULES:
-        module = importlib.import_module(f"mtpcr_geo.pipeline.{name}")
+        module = importlib.import_module(f"mtpcr_geo.pipeline.stages.{name}")
         for value in vars(module).values():
             if inspect.isclass(value) and issubclass(value, Stage) and not inspect.isabstract(value):
                 kind = getattr(value, "type", None)

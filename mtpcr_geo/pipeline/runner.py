@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mtpcr_geo.errors import InputError, MtpcrError, OptionError, RegistrationError
-from mtpcr_geo.export.files import OutputSet
-from mtpcr_geo.pipeline.facts import versions
+from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError, RegistrationError
+from mtpcr_geo.core.progress import NoProgress
+from mtpcr_geo.core.system import versions
+from mtpcr_geo.core.types import Pair, Verdict
+from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.pipeline.grammar import StageSpec
 from mtpcr_geo.pipeline.plan import plan
 from mtpcr_geo.pipeline.stage import Progress, RunContext, Stage, Value
-from mtpcr_geo.progress import NoProgress
-from mtpcr_geo.scene import Pair, Verdict
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ def _turn(stage: Stage, inputs: Sequence[Value | None], context: RunContext) -> 
 
 
 def _input_facts(stages: Mapping[str, Stage]) -> list[dict[str, Any]]:
-    from mtpcr_geo.cloud.las import sha256
+    from mtpcr_geo.io.las import sha256
 
     paths = dict.fromkeys(path for stage in stages.values() for path in stage.reads() if path.is_file())
     return [{"path": str(path), "bytes": path.stat().st_size, "sha256": sha256(path)} for path in paths]

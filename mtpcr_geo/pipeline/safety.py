@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from mtpcr_geo.errors import OptionError
+from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.pipeline.grammar import StageSpec
 
 CODE_STAGES = frozenset({"filters.python", "filters.matlab", "filters.julia", "readers.numpy"})

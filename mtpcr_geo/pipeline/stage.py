@@ -12,11 +12,11 @@ from typing import Any, ClassVar, Protocol
 
 from pydantic import BaseModel, ConfigDict
 
-from mtpcr_geo.audit import NullRecorder, Recorder
-from mtpcr_geo.cloud.base import Cloud
-from mtpcr_geo.errors import OptionError
-from mtpcr_geo.export.files import OutputSet
-from mtpcr_geo.scene import Pair
+from mtpcr_geo.core.cloud import Cloud
+from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.recorder import NullRecorder, Recorder
+from mtpcr_geo.core.types import Pair
+from mtpcr_geo.io.outputs import OutputSet
 
 Value = Cloud | Pair
 

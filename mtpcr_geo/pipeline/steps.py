@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from mtpcr_geo.errors import OptionError
-from mtpcr_geo.options import MethodOptions
+from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.pipeline.options import MethodOptions
 
 MANY_TRIES = 20_000
 """Pairs of ties tried for the robust start with keypoint matchers, of whose matches few may be right."""

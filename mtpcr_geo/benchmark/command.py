@@ -1,0 +1,76 @@
+"""The verb `benchmark` of the command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mtpcr_geo.cli.shared import Quiet, progress_bars
+
+
+def benchmark(
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="Folder of the results; what is there is kept.", show_default=False),
+    ],
+    data: Annotated[
+        list[Path] | None, typer.Option(help="Folder of pairs (source.laz, target.laz, pair.json each).")
+    ] = None,
+    simulated: Annotated[int, typer.Option(help="Number of sites to simulate.")] = 0,
+    standins: Annotated[
+        bool, typer.Option("--standins", help="Simulate the paper's fourteen combinations.")
+    ] = False,
+    graco: Annotated[Path | None, typer.Option(help="Folder of GrAco's bags and calibrations.")] = None,
+    methods: Annotated[
+        list[str],
+        typer.Option("--methods", "-m", help="Methods, with options: 'mtpcr-geo kiss-matcher:voxel=1'."),
+    ] = ["mtpcr-geo"],  # noqa: B006 - typer copies it
+    starts: Annotated[int, typer.Option(min=1, help="Random starts of each pair.")] = 10,
+    jobs: Annotated[int, typer.Option(min=1, help="Runs at a time.")] = 1,
+    yaw: Annotated[float, typer.Option(help="Starts are turned by 0 to this, degrees.")] = 360.0,
+    tilt: Annotated[float, typer.Option(help="Starts are tilted by 0 to this, degrees.")] = 0.0,
+    shift: Annotated[float, typer.Option(help="Starts are moved by 0 to this, metres.")] = 100.0,
+    seed: Annotated[int, typer.Option(help="Seed of the starts.")] = 0,
+    only: Annotated[list[str] | None, typer.Option(help="Pairs whose names contain this.")] = None,
+    kinds: Annotated[
+        str, typer.Option(help="Kinds of simulated sites, such as 'town forest'; else all.")
+    ] = "",
+    overlaps: Annotated[str, typer.Option(help="Overlaps of simulated sites, such as '0.4 0.1'.")] = "0.18",
+    pairs: Annotated[
+        Path | None, typer.Option(help="Folder for pairs that are made; else OUT/pairs.")
+    ] = None,
+    time_limit: Annotated[float, typer.Option(help="Longest a run may take, seconds.")] = 600.0,
+    quiet: Quiet = False,
+) -> None:
+    """Run methods on pairs with a known transform, from random starts; write tables and plots.
+
+    An interrupted benchmark goes on where it stopped when the same command is given again.
+    """
+    from mtpcr_geo.benchmark.runs import Wanted, numbers_of, run_benchmark, shown
+    from mtpcr_geo.benchmark.worker import StartRange
+
+    wanted = Wanted(
+        tuple(data or ()),
+        simulated,
+        standins,
+        graco,
+        tuple(only or ()),
+        tuple(kinds.split()),
+        numbers_of(overlaps),
+    )
+    with progress_bars(quiet) as progress:
+        rows = run_benchmark(
+            wanted,
+            [word for text in methods for word in text.split()],
+            out,
+            pairs=pairs,
+            starts=starts,
+            ranges=StartRange(yaw, tilt, shift, seed),
+            jobs=jobs,
+            time_limit_s=time_limit,
+            progress=progress,
+        )
+    if not quiet:
+        typer.echo(shown(rows) + f"\nTables and plots: {out}")

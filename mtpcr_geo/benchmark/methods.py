@@ -1,0 +1,160 @@
+"""What the benchmark asks of a method, and which methods there are.
+
+A method is named on the command line by its name and, where wanted, options of its own:
+``fpfh-ransac:voxel=1.5,icp=false``. The label in the tables is that text.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo.benchmark.simulator.raycast import import_open3d
+from mtpcr_geo.core.errors import MissingPartError, OptionError
+from mtpcr_geo.core.suggestions import meant
+
+Floats = NDArray[np.float64]
+Judgement = Literal["accepted", "doubtful", "refused", "unjudged"]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a method answers.
+
+    Attributes:
+        T_target_source: 4x4, or None where it found nothing.
+        verdict: its own; "unjudged" from a method that never doubts its answer.
+        reason: why it refuses or doubts, or what it says.
+        details: numbers worth keeping with the run.
+        memory_mib: peak memory where the method ran elsewhere; else it is measured around the call.
+
+    """
+
+    T_target_source: Floats | None
+    verdict: Judgement = "unjudged"
+    reason: str = ""
+    details: dict[str, Any] = field(default_factory=dict)
+    memory_mib: float | None = None
+
+
+class Method(Protocol):
+    """A method under test."""
+
+    def estimate(self, source: Floats, target: Floats, *, seed: int) -> Estimate:
+        """Find the transform.
+
+        Args:
+            source: (n, 3) float64, metres, somewhere; z about up.
+            target: (m, 3) float64, metres, about the origin; z up.
+            seed: of everything random.
+
+        Raises:
+            MtpcrError: where there is no answer; the run then counts as one without.
+
+        """
+
+
+@dataclass(frozen=True)
+class _Entry:
+    module: str
+    factory: str
+    needs: tuple[str, ...] = ()
+    advice: str = "pip install 'mtpcr-geo[benchmark]'"
+
+
+_OPEN3D = "mtpcr_geo.benchmark.baselines.fpfh"
+_KISS = "mtpcr_geo.benchmark.baselines.kiss"
+METHODS: dict[str, _Entry] = {
+    "mtpcr-geo": _Entry(
+        "mtpcr_geo.benchmark.own_method",
+        "Ours",
+        ("cv2", "scipy.fft", "scipy.ndimage", "scipy.spatial", "small_gicp"),
+    ),
+    "icp": _Entry("mtpcr_geo.benchmark.baselines.icp", "PointToPointIcp", ("small_gicp",)),
+    "fpfh-svd": _Entry(_OPEN3D, "FpfhSvd", ("open3d",)),
+    "fpfh-ransac": _Entry(_OPEN3D, "FpfhRansac", ("open3d",)),
+    "fpfh-fgr": _Entry(_OPEN3D, "FpfhFgr", ("open3d",)),
+    "fpfh-gnc": _Entry(_KISS, "FpfhGnc", ("open3d", "kiss_matcher")),
+    "kiss-matcher": _Entry(_KISS, "KissMatcher", ("kiss_matcher",)),
+    "fpfh-teaser": _Entry(
+        "mtpcr_geo.benchmark.baselines.teaser",
+        "FpfhTeaser",
+        ("open3d", "teaserpp_python"),
+        "build TEASER++'s Python binding, which no package index has",
+    ),
+    "external": _Entry("mtpcr_geo.benchmark.baselines.external", "External"),
+}
+
+
+def make_method(spec: str) -> Method:
+    """Make a method from its name and options.
+
+    Raises:
+        OptionError: if there is no such method or option.
+        MissingPartError: if a library it needs is not installed.
+
+    """
+    name = spec.partition(":")[0]
+    entry = METHODS.get(name)
+    if entry is None:
+        hint = meant(name, list(METHODS)) or f"; choose from {', '.join(METHODS)}"
+        raise OptionError(f"there is no benchmark method {name!r}{hint}")
+    for library in entry.needs:
+        if importlib.util.find_spec(library) is None:
+            raise MissingPartError(
+                f"the method {name} needs {library}, which is not installed: {entry.advice}"
+            )
+    factory: Callable[..., Method] = getattr(importlib.import_module(entry.module), entry.factory)
+    options = options_of(spec)
+    known = inspect.signature(factory).parameters
+    if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values()):
+        for key in options:
+            if key not in known:
+                raise OptionError(f"the method {name} has no option {key!r}{meant(key, list(known))}")
+    try:
+        return factory(**options)
+    except (TypeError, ValueError) as error:
+        raise OptionError(f"the method {spec!r} cannot be made: {error}") from error
+
+
+def load_libraries(spec: str) -> None:
+    """Import what a method uses, so that the time of its first run is not that of loading."""
+    for library in METHODS[spec.partition(":")[0]].needs:
+        if library == "open3d":
+            import_open3d()
+        else:
+            importlib.import_module(library)
+
+
+def options_of(spec: str) -> dict[str, Any]:
+    """Read the options in a method's text: numbers, yes and no, or words.
+
+    Raises:
+        OptionError: if one is not of the form ``option=value``.
+
+    """
+    options: dict[str, Any] = {}
+    for part in filter(None, spec.partition(":")[2].split(",")):
+        key, equals, value = part.partition("=")
+        if not equals:
+            raise OptionError(f"in the method {spec!r}, {part!r} is not of the form option=value")
+        options[key.strip()] = _value(value.strip())
+    return options
+
+
+def _value(text: str) -> Any:
+    if text.lower() in ("true", "yes", "false", "no"):
+        return text.lower() in ("true", "yes")
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text

@@ -1,0 +1,1 @@
+"""The command `mtpcr-geo`: one module for each verb."""

@@ -1,0 +1,1 @@
+"""Transforms, grids, clouds, types and small tools that every other room builds on."""

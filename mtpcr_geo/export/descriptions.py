@@ -1,0 +1,245 @@
+"""What a run came to, in words and rows, for the report and the recording alike."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.types import Floats, Pair, Side, Verdict
+from mtpcr_geo.crs import FrameLink, TransformChain, facts_of
+from mtpcr_geo.export.tie_points import tie_positions
+from mtpcr_geo.export.transform import units_of
+
+Row = tuple[str, str]
+
+_MEANING = {
+    "accepted": "The source fits the target; the checks that did not take part in the fit agree.",
+    "doubtful": "A transform was found, but the checks leave room for doubt: look at it before use.",
+    "refused": "The checks speak against the transform; no registered cloud is written unless forced.",
+}
+_UNITS = (("_m2", "m²"), ("_m", "m"), ("_deg", "°"), ("_s", "s"), ("_mb", "MB"), ("_cells", "cells"))
+_SHARES = ("_share", "overlap_source", "overlap_target", "_support")
+
+
+def verdict_meaning(verdict: Verdict) -> str:
+    """Say in a sentence what a verdict means for the user."""
+    return _MEANING[verdict.name]
+
+
+def metric_rows(metrics: Mapping[str, Any]) -> list[Row]:
+    """Give numbers as (name in words, value with its unit), read from the unit in each name."""
+    rows = []
+    for key, value in metrics.items():
+        if isinstance(value, Mapping):
+            rows += [(f"{_words(key)}: {name}", text) for name, text in metric_rows(value)]
+        else:
+            rows.append(_metric_row(key, value))
+    return rows
+
+
+def side_rows(side: Side) -> list[Row]:
+    """Say what a cloud is: file, points, CRS, extent, how it was levelled, its raster."""
+    cloud = side.cloud
+    crs = side.link.file_crs.name if side.link.file_crs is not None else "none (local coordinates)"
+    extent = np.ptp(side.sample, axis=0) if len(side.sample) else np.zeros(3)
+    rows = [
+        ("file", Path(cloud.name).name),
+        ("points", f"{cloud.count:,}"),
+        ("CRS", crs),
+        ("units", units_text(side.link)),
+        *_way_rows(side.link),
+        ("extent", f"{extent[0]:.1f} × {extent[1]:.1f} m, {extent[2]:.1f} m high"),
+        ("work origin", ", ".join(f"{value:.0f}" for value in side.link.origin) + " m"),
+    ]
+    tilt = math.degrees(transforms.rotation_angle(side.T_level_work[:3, :3]))
+    rows.append(("levelling", f"turned by {tilt:.2f}°" if tilt > 0 else "left upright"))
+    if side.bev is not None:
+        grid = side.bev.grid
+        share = float(np.count_nonzero(side.bev.count)) / max(side.bev.count.size, 1)
+        rows.append(("raster", f"{grid.width} × {grid.height} cells of {grid.cell:g} m, {share:.0%} filled"))
+    return rows
+
+
+def transform_rows(pair: Pair) -> list[Row]:
+    """Say what the transform does: yaw, tilt, how the middle of the source moves, how ties fit."""
+    if pair.T_target_source is None:
+        return []
+    R = pair.T_target_source[:3, :3]
+    yaw = transforms.yaw_of(R)
+    tilt = math.degrees(transforms.rotation_angle(transforms.yaw_matrix(yaw).T @ R))
+    rows = [("yaw", f"{math.degrees(yaw):+.4f}° (counter-clockwise from above)"), ("tilt", f"{tilt:.4f}°")]
+    moved = shift_text(pair)
+    if moved:
+        rows.append(("the middle moves by", moved))
+    rows.append(("result in", result_text(pair)))
+    offset = TransformChain.of(pair).vertical_offset_m
+    if offset is not None:
+        rows.append(("height offset found", f"{offset:+.3f} m, added to the source's heights"))
+    if pair.ties is not None and len(pair.ties.target):
+        inlier = np.asarray(pair.ties.inlier, bool)
+        rows.append(("ties", f"{len(inlier)}, of which {int(inlier.sum())} agree with the transform"))
+        if inlier.any():
+            off = misfits(pair)[inlier]
+            plan, height = np.median(np.hypot(off[:, 0], off[:, 1])), np.median(np.abs(off[:, 2]))
+            rows.append(("misfit of those", f"median {plan:.2f} m in plan, {height:.2f} m in height"))
+    icp = pair.refine_report.get("icp")
+    if icp:
+        rows.append(("refined by", refinement_text(icp)))
+    return rows
+
+
+def refinement_text(icp: Mapping[str, Any]) -> str:
+    """Say which of the refinements was taken, from the report of `mtpcr_geo.method.refine.follow_icp`."""
+    misfit = icp["tried"][icp["chosen"]]["misfit"]
+    if icp["followed"]:
+        rounds = ", ".join(f"{one['reach_m']:g}" for one in icp["rounds"])
+        return f"ICP ({icp['method']}) with reaches of {rounds} m; surface misfit {misfit:.2f}"
+    why = "ICP lost the ties" if icp["lost_ties"] else "after ICP surfaces met worse"
+    kept = {"ties": "the ties alone", "ground": "ties and ground"}[icp["chosen"]]
+    return f"{kept}: {why}; surface misfit {misfit:.2f}"
+
+
+def units_text(link: FrameLink) -> str:
+    """Name the units of a file's coordinates, across and up, and what its heights count from."""
+    across, _, up = units_of(link)
+    units = across if across == up else f"{across} across, {up} up"
+    return f"{units}; {facts_of(link.file_crs).height_name}"
+
+
+def shift_text(pair: Pair) -> str:
+    """Say how far the source's middle moves: metres in the work frame, or in the files' local frame.
+
+    Empty where source and target share no frame, so that no shift has a meaning.
+    """
+    chain = TransformChain.of(pair)
+    shift = chain.shift_m
+    if shift is not None and pair.frame.crs is not None:
+        return f"{_numbers(shift, 3, sign=True)} m (east, north, up in {pair.frame.crs.name})"
+    if pair.source.link.file_crs is None and pair.target.link.file_crs is None:
+        shift = chain.forward(chain.pivot[None])[0] - chain.pivot
+        return f"{_numbers(shift, 3, sign=True)} m (x, y, z)"
+    return ""
+
+
+def result_text(pair: Pair) -> str:
+    """Name the CRS and the units of the registered cloud."""
+    link = pair.frame.output or pair.target.link
+    name = link.file_crs.name if link.file_crs is not None else "local coordinates of the target"
+    return f"{name}: {units_text(link)}"
+
+
+def _way_rows(link: FrameLink) -> list[Row]:
+    """Say how a file's coordinates come to the work frame, and what had to be assumed."""
+    report = link.report
+    rows = []
+    if "operation" in report:
+        accuracy = report.get("accuracy_m")
+        how = "accuracy not stated" if accuracy is None else f"good to {accuracy:g} m"
+        grids = ", ".join(report.get("grids", ()))
+        rows.append(("way to the work frame", f"{report['operation']} ({how}{'; ' if grids else ''}{grids})"))
+    return rows + [("note", note) for note in report.get("notes", ())]
+
+
+def worked_example(pair: Pair) -> tuple[Floats, Floats] | None:
+    """Give one point, the middle of the source, before and after: (3,) source and target file coordinates.
+
+    The way goes through the whole chain, not through the single 4x4, so it can serve to check that.
+    """
+    if pair.T_target_source is None:
+        return None
+    middle = (pair.source.cloud.minimum + pair.source.cloud.maximum) / 2
+    before: Floats = np.asarray(np.round(middle, 3), np.float64)
+    return before, TransformChain.of(pair).forward(before[np.newaxis])[0]
+
+
+def misfits(pair: Pair) -> Floats:
+    """Give registered source minus target of each tie, (n, 3) metres; NaN where there is no transform."""
+    target, registered = tie_positions(pair)
+    return np.full_like(target, np.nan) if registered is None else registered - target
+
+
+def hypothesis_rows(pair: Pair) -> list[tuple[str, ...]]:
+    """Give the candidate poses as (rank, yaw, shift, score, overlap) in words, best first."""
+    if pair.matches is None:
+        return []
+    cell = pair.target.bev.grid.cell if pair.target.bev is not None else math.nan
+    return [
+        (
+            str(rank),
+            f"{_half_turn(math.degrees(one.yaw)):+.1f}°",
+            f"{one.shift[0]:+.1f}, {one.shift[1]:+.1f} m",
+            f"{one.score:.4g}",
+            f"{one.overlap_cells * cell * cell:,.0f} m²" if one.overlap_cells else "",
+        )
+        for rank, one in enumerate(pair.matches.hypotheses, start=1)
+    ]
+
+
+def matrix_text(T: Floats) -> str:
+    """Write a 4x4 with 17 significant digits, a row a line."""
+    return "\n".join("  ".join(f"{value: .17g}".ljust(24) for value in row).rstrip() for row in T)
+
+
+def plain(value: Any) -> str:
+    """Give any option or property as one short line."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {plain(one)}" for key, one in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(plain(one) for one in value)
+    return str(value)
+
+
+def markdown_table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Lay out rows as a Markdown table."""
+    head = list(head)
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines += ["| " + " | ".join(cell.replace("|", "/") for cell in row) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def _metric_row(key: str, value: Any) -> Row:
+    if value is None:
+        return _words(key), "not known"
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, bool):
+        return _words(key), "yes" if value else "no"
+    if isinstance(value, list | tuple | np.ndarray) and key.endswith("_m"):
+        return _words(key.removesuffix("_m")), f"{_numbers(np.asarray(value), 3)} m"
+    if not isinstance(value, int | float):
+        return _words(key), plain(value)
+    if key.endswith(_SHARES):
+        return _words(key), f"{100 * float(value):.1f} %"
+    for suffix, unit in _UNITS:
+        if key.endswith(suffix):
+            gap = "" if unit == "°" else " "
+            return _words(key.removesuffix(suffix)), f"{_short(value)}{gap}{unit}"
+    return _words(key), _short(value)
+
+
+def _short(value: float) -> str:
+    if float(value).is_integer() and abs(value) < 1e15:
+        return f"{int(value):,}"
+    return f"{value:,.1f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def _words(key: str) -> str:
+    return key.replace("_", " ")
+
+
+def _numbers(values: Floats, digits: int, sign: bool = False) -> str:
+    return ", ".join(f"{value:{'+' if sign else ''}.{digits}f}" for value in values)
+
+
+def _half_turn(degrees: float) -> float:
+    """Wrap degrees to -180..180 as they will be shown, without a minus before zero."""
+    return round((degrees + 180.0) % 360.0 - 180.0, 1) + 0.0

@@ -1,0 +1,277 @@
+"""BEVs as GeoTIFF: absolute heights, where they lie, and what the numbers mean, for any GIS."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo import __version__
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.errors import OutputError
+from mtpcr_geo.core.grid import Grid
+from mtpcr_geo.core.types import Bev, Pair, Side
+from mtpcr_geo.crs import WorkFrame
+
+Floats = NDArray[np.float64]
+
+BANDS = (
+    ("highest z in the cell, metres", "metre"),
+    ("lowest z in the cell, metres", "metre"),
+    ("points in the cell", "count"),
+)
+_TILE = 256
+_SMALLEST_OVERVIEW = 128
+_WARP_CELLS = 500_000
+
+
+def write_bev(
+    path: str | os.PathLike[str],
+    bev: Bev,
+    frame: WorkFrame,
+    *,
+    T_level_work: Floats | None = None,
+    tags: Mapping[str, str] | None = None,
+) -> None:
+    """Write a BEV as a tiled, compressed float32 GeoTIFF with overviews.
+
+    Bands: highest z, lowest z (both absolute: the origin's z is added; NaN is nodata) and the number of
+    points (0 where empty). Cell edges, not centres, carry the geotransform (AREA_OR_POINT=Area).
+
+    Args:
+        path: where to write; no other file is left beside it.
+        bev: the raster, in levelled work coordinates, metres.
+        frame: CRS and origin of the work coordinates that the BEV's side has.
+        T_level_work: 4x4 from work to levelled coordinates. Where it is not the identity the raster's
+            positions are not CRS coordinates, so the file gets no CRS and says in its tags how the
+            levelled frame lies.
+        tags: further tags for the file.
+
+    Raises:
+        OutputError: if the file cannot be written.
+
+    """
+    import rasterio
+    from rasterio.enums import Resampling
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+    level = np.eye(4) if T_level_work is None else np.asarray(T_level_work, np.float64)
+    upright = bool(np.array_equal(level, np.eye(4)))
+    grid = bev.grid
+    profile: dict[str, Any] = {
+        "driver": "GTiff",
+        "dtype": "float32",
+        "count": len(BANDS),
+        "width": grid.width,
+        "height": grid.height,
+        "nodata": float("nan"),
+        "transform": geotransform(grid, frame.origin),
+        "crs": frame.crs.to_wkt() if frame.crs is not None and upright else None,
+        "tiled": True,
+        "blockxsize": _TILE,
+        "blockysize": _TILE,
+        "compress": "deflate",
+        "zlevel": 4,
+        "num_threads": "ALL_CPUS",
+        "predictor": 3,
+        "interleave": "band",
+        "BIGTIFF": "IF_SAFER",
+    }
+    every_tag = {
+        "AREA_OR_POINT": "Area",
+        "TIFFTAG_SOFTWARE": f"mtpcr_geo {__version__}",
+        "CELL_SIZE": f"{grid.cell:.17g} metre",
+        "HEIGHTS": "absolute: highest and lowest z of the points whose plan position falls into the cell",
+        **_frame_tags(frame, level, upright),
+        **(tags or {}),
+    }
+    try:
+        with rasterio.Env(GDAL_PAM_ENABLED="NO"), warnings.catch_warnings():
+            # a local raster with its corner at zero is georeferenced all the same
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(path, "w", **profile) as out:
+                out.update_tags(**every_tag)
+                for index, (text, unit) in enumerate(BANDS, start=1):
+                    out.set_band_description(index, text)
+                    out.set_band_unit(index, unit)
+                out.write(_absolute(bev.top, frame), 1)
+                out.write(_absolute(bev.low, frame), 2)
+                out.write(bev.count.astype(np.float32), 3)
+            factors = overview_factors(grid)
+            if factors:
+                with rasterio.open(path, "r+") as out:
+                    out.build_overviews(factors, Resampling.average)
+    except (RasterioError, OSError) as error:
+        raise OutputError(f"cannot write the raster {Path(path)}: {error}") from error
+
+
+def write_side_bev(path: str | os.PathLike[str], side: Side, frame: WorkFrame | None = None) -> None:
+    """Write a side's BEV in that side's own frame.
+
+    Args:
+        path: where to write.
+        side: a side with a BEV.
+        frame: the pair's work frame, whose CRS the side's work coordinates have where its link
+            converts units or CRS; without it such a raster gets no CRS.
+
+    Raises:
+        ValueError: if the side has no BEV yet.
+        OutputError: if the file cannot be written.
+
+    """
+    if side.bev is None:
+        raise ValueError(f"the {side.role} has no BEV yet")
+    link = side.link
+    converted = link.pipeline is not None or bool(np.any(link.factor != 1.0))
+    crs = link.file_crs if not converted else frame.crs if frame is not None else None
+    tags = {"ROLE": side.role, "CLOUD": Path(side.cloud.name).name}
+    write_bev(path, side.bev, WorkFrame(crs, link.origin), T_level_work=side.T_level_work, tags=tags)
+
+
+def write_registered_bev(path: str | os.PathLike[str], pair: Pair) -> None:
+    """Write the source's BEV as the found transform places it, in the target's CRS, upright.
+
+    Laid over the target in a GIS it shows at once whether the registration holds.
+
+    Raises:
+        ValueError: if the pair is not solved or the source has no BEV yet.
+        OutputError: if the file cannot be written.
+
+    """
+    tags = {
+        "ROLE": "source, registered to the target",
+        "CLOUD": Path(pair.source.cloud.name).name,
+        "RESAMPLING": "nearest cell of the source's BEV, moved by the found transform",
+    }
+    write_bev(path, registered_bev(pair), pair.frame, tags=tags)
+
+
+def registered_bev(pair: Pair) -> Bev:
+    """Resample the source's BEV to where the transform places it, in upright target work coordinates.
+
+    The grid has the source's cell size and is aligned to whole cells, so it nests with the target's
+    where both cells agree.
+
+    Raises:
+        ValueError: if the pair is not solved or the source has no BEV yet.
+
+    """
+    bev = pair.source.bev
+    if pair.T_target_source is None or bev is None:
+        raise ValueError("the pair needs a transform and the source a BEV to be laid over the target")
+    T_target_levelled = pair.T_target_source @ transforms.inverse(pair.source.T_level_work)
+    return warp_bev(bev, T_target_levelled, grid_around(bev, T_target_levelled))
+
+
+def grid_around(bev: Bev, T_to_bev: Floats) -> Grid:
+    """Give the grid, aligned to whole cells, that holds a BEV's filled cells moved by a 4x4 transform."""
+    cell = bev.grid.cell
+    filled = np.isfinite(bev.top)
+    rows = np.flatnonzero(filled.any(axis=1))
+    if len(rows) == 0:
+        return Grid(0.0, cell, cell, 1, 1)
+    # the ends of the rows bound all cells between them
+    first = filled[rows].argmax(axis=1)
+    last = bev.grid.width - 1 - filled[rows, ::-1].argmax(axis=1)
+    ends = np.column_stack([np.concatenate([first, last]), np.concatenate([rows, rows])])
+    xyz = np.column_stack([bev.grid.to_metres(ends.astype(np.float64)), bev.top[ends[:, 1], ends[:, 0]]])
+    moved = transforms.apply(T_to_bev, xyz)[:, :2]
+    low = np.floor(moved.min(axis=0) / cell - 0.5)
+    high = np.ceil(moved.max(axis=0) / cell + 0.5)
+    width, height = (int(size) for size in high - low)
+    return Grid(float(low[0]) * cell, float(high[1]) * cell, cell, width, height)
+
+
+def warp_bev(bev: Bev, T_to_bev: Floats, grid: Grid) -> Bev:
+    """Resample a BEV to another grid under a 4x4 rigid transform that is mostly yaw and shift.
+
+    Every cell of `grid` takes the nearest cell of `bev`; heights are moved exactly, and a small tilt
+    is allowed for by two fixed-point steps on the height of what is found.
+
+    Args:
+        bev: what to resample.
+        T_to_bev: 4x4 from the BEV's coordinates to those of `grid`, metres.
+        grid: where to resample to.
+
+    """
+    filled = np.isfinite(bev.top)
+    height = float(np.median(bev.top[filled])) if filled.any() else 0.0
+    top = np.full(grid.shape, np.nan, np.float32)
+    low = np.full(grid.shape, np.nan, np.float32)
+    count = np.zeros(grid.shape, np.uint32)
+    rows_at_once = max(1, _WARP_CELLS // grid.width)
+    for start in range(0, grid.height, rows_at_once):
+        rows = np.arange(start, min(start + rows_at_once, grid.height))
+        row = np.repeat(rows, grid.width)
+        column = np.tile(np.arange(grid.width), len(rows))
+        plan = grid.to_metres(np.column_stack([column, row]).astype(np.float64))
+        found, xyz_bev, index = _look_back(bev, filled, T_to_bev, plan, height)
+        row, column, xyz_bev, index = row[found], column[found], xyz_bev[found], index[found]
+        top[row, column] = _move_z(T_to_bev, xyz_bev, bev.top.ravel()[index])
+        low[row, column] = _move_z(T_to_bev, xyz_bev, bev.low.ravel()[index])
+        count[row, column] = bev.count.ravel()[index]
+    return Bev(grid, top, low, count)
+
+
+def _look_back(
+    bev: Bev, filled: NDArray[np.bool_], T_to_bev: Floats, plan: Floats, height: float
+) -> tuple[NDArray[np.bool_], Floats, NDArray[np.int64]]:
+    """Find the BEV's cell for each of (n, 2) places: found or not, (n, 3) place in the BEV, flat index."""
+    T_bev_to = transforms.inverse(T_to_bev)
+    z_to = np.full(len(plan), (T_to_bev @ np.array([0.0, 0.0, height, 1.0]))[2])
+    tilted = abs(T_to_bev[2, 2]) < 1.0 - 1e-7
+    for last in (False, False, True) if tilted else (True,):
+        xyz_bev = transforms.apply(T_bev_to, np.column_stack([plan, z_to]))
+        pixel = np.rint(bev.grid.to_pixel(xyz_bev[:, :2])).astype(np.int64)
+        inside = ((pixel >= 0) & (pixel < [bev.grid.width, bev.grid.height])).all(axis=1)
+        index = np.where(inside, pixel[:, 1] * bev.grid.width + pixel[:, 0], 0)
+        found = inside & filled.ravel()[index]
+        if not last:
+            z_to = np.where(found, _move_z(T_to_bev, xyz_bev, bev.top.ravel()[index]), z_to)
+    return found, xyz_bev, index
+
+
+def geotransform(grid: Grid, origin: Floats) -> Any:
+    """Give the affine from pixel corners to CRS coordinates of a grid whose frame has this origin."""
+    from affine import Affine
+
+    return Affine(
+        grid.cell, 0.0, grid.west + float(origin[0]), 0.0, -grid.cell, grid.north + float(origin[1])
+    )
+
+
+def overview_factors(grid: Grid) -> list[int]:
+    """Give the powers of two at which a raster of this size deserves overviews."""
+    factors = []
+    factor = 2
+    while max(grid.width, grid.height) / factor >= _SMALLEST_OVERVIEW:
+        factors.append(factor)
+        factor *= 2
+    return factors
+
+
+def _move_z(T: Floats, xyz: Floats, z: NDArray[np.float32]) -> Floats:
+    """Heights after T of points with the plan position of `xyz` and height `z`."""
+    return np.asarray(T[2, 0] * xyz[:, 0] + T[2, 1] * xyz[:, 1] + T[2, 2] * z + T[2, 3])
+
+
+def _absolute(z: NDArray[np.float32], frame: WorkFrame) -> NDArray[np.float32]:
+    return (z.astype(np.float64) + float(frame.origin[2])).astype(np.float32)
+
+
+def _frame_tags(frame: WorkFrame, level: Floats, upright: bool) -> dict[str, str]:
+    origin = " ".join(f"{value:.17g}" for value in frame.origin)
+    if upright:
+        kind = "coordinates of the CRS" if frame.crs is not None else "local coordinates in metres"
+        return {"FRAME": kind, "LEVELLED": "no", "WORK_ORIGIN": origin}
+    return {
+        "FRAME": "levelled coordinates plus the work origin: a tilted frame, so no CRS is set",
+        "LEVELLED": "yes",
+        "WORK_ORIGIN": origin,
+        "T_LEVEL_WORK": " ".join(f"{value:.17g}" for value in level.ravel()),
+    }

@@ -1,0 +1,93 @@
+"""What keypoint matching leaves in a recording: images, keypoints, the sweep, FOCUS before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from mtpcr_geo.core.types import Floats, Pair, Side
+from mtpcr_geo.export import drawing
+
+_IMAGE_SIDE = 2048
+_KEYPOINT_RGB = (255, 190, 60)
+_MOST_KEYPOINTS = 20_000
+
+
+@dataclass(frozen=True)
+class Pen:
+    """How to write into a recording.
+
+    Attributes:
+        log: logs something under an entity path.
+        image: logs a picture under an entity path, shrunk to a largest side of 2048.
+
+    """
+
+    log: Callable[[str, Any], None]
+    image: Callable[[str, drawing.Picture], None]
+
+
+def log_appearance(pen: Pen, side: Side) -> None:
+    """Log the grey image of heights and the image that is matched: before and after enhancement."""
+    if side.appearance is None:
+        return
+    pen.image(f"enhancement/{side.role}/before", side.appearance.plain)
+    pen.image(f"enhancement/{side.role}/after", side.appearance.image)
+
+
+def log_keypoints(pen: Pen, pair: Pair) -> None:
+    """Log all keypoints, and those matched, on the image in which they were found."""
+    matches = pair.matches
+    if matches is None:
+        return
+    for side, found, used in (
+        (pair.source, matches.source_keypoints, matches.source_px),
+        (pair.target, matches.target_keypoints, matches.target_px),
+    ):
+        if found is None or side.appearance is None:
+            continue
+        root = f"keypoints/{side.role}"
+        pen.image(f"{root}/image", side.appearance.image)
+        scale = min(1.0, _IMAGE_SIDE / max(side.appearance.image.shape))
+        for name, px, rgb, radius in (
+            ("all", found, _KEYPOINT_RGB, 1.5),
+            ("matched", used, drawing.UNJUDGED_RGB, 3.0),
+        ):
+            # rerun's pixels have their centres at halves
+            at = (px[:_MOST_KEYPOINTS] + 0.5) * scale
+            pen.log(
+                f"{root}/{name}",
+                rr.Points2D(at, colors=rgb, radii=rr.Radius.ui_points(radius), draw_order=10.0 + radius),
+            )
+
+
+def log_sweep(pen: Pen, pair: Pair) -> None:
+    """Log how many matches agreed in every orientation of the source."""
+    told = pair.matches.report if pair.matches is not None else {}
+    turns = told.get("turns_deg")
+    if not turns or len(turns) < 2:
+        return
+    step = 360.0 / len(turns)
+    for name in ("agreeing", "matches"):
+        counts = np.array(told[f"turn_{name}"], np.float64)
+        widths = np.full(len(turns), 0.8 * step, np.float32)
+        left = np.array(turns, np.float64) - 0.4 * step
+        pen.log(f"sweep/{name}", rr.BarChart(counts, abscissa=left, widths=widths, color=drawing.GOOD_RGB))
+
+
+def log_focus(pen: Pen, pair: Pair) -> None:
+    """Log the matches before and after FOCUS, on both rasters beside each other."""
+    matches = pair.matches
+    if matches is None or matches.before_focus is None:
+        return
+    for name, one in (("before", matches.before_focus), ("after", matches)):
+        bare = pair.with_(matches=one, ties=None, T_target_source=None)
+        picture, ends, colours, _ = drawing.match_lines(bare)
+        pen.image(f"focus/{name}/image", picture)
+        at: Floats = (ends + 0.5) * min(1.0, _IMAGE_SIDE / max(picture.shape[:2]))
+        lines = rr.LineStrips2D(at, colors=colours, radii=rr.Radius.ui_points(0.8), draw_order=20.0)
+        pen.log(f"focus/{name}/lines", lines)

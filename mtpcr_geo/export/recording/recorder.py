@@ -1,0 +1,85 @@
+"""The recording: what every stage took and made, as a file for the rerun viewer.
+
+Everything that is drawn is written by one worker thread while the run goes on: the values that stages
+hand on never change, so nothing has to be copied and the run hardly waits.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from mtpcr_geo.core.errors import OutputError
+
+DEFAULT_BUDGET = 200_000
+
+
+class RerunRecorder:
+    """Writes a run to an `.rrd` file, with a layout for the viewer saved in it.
+
+    Points are float32 in the work frame of their side (metres near zero); CRS, origins, file hashes,
+    versions and options are recording properties.
+
+    Args:
+        path: the file to write; put in place by whoever gave the name.
+        budget: points a cloud and picture at most; larger clouds are thinned by a seeded choice.
+        seed: of the thinning.
+
+    Raises:
+        OutputError: from `close`, if the file could not be written.
+
+    """
+
+    def __init__(self, path: str | os.PathLike[str], budget: int = DEFAULT_BUDGET, seed: int = 0) -> None:
+        self.path = Path(path)
+        self._worker: ThreadPoolExecutor | None = ThreadPoolExecutor(1, thread_name_prefix="recording")
+        self._jobs: list[Future[None]] = []
+        self._writer: Any = None
+        self._submit(self._open, budget, seed)
+
+    def begin(self, properties: dict[str, Any]) -> None:
+        """Note what holds for the whole run: CRS, origin, file hashes, versions, options."""
+        kept = dict(properties)
+        self._submit(lambda: self._writer.begin(kept))
+
+    def after(
+        self, stage_type: str, tag: str, options: dict[str, Any], value: object, seconds: float
+    ) -> None:
+        """Note a finished stage and what it made (a `Pair`, a `Cloud` or None)."""
+        kept = dict(options)
+        self._submit(lambda: self._writer.after(stage_type, tag, kept, value, seconds))
+
+    def close(self) -> None:
+        """Finish the recording; a second call does nothing.
+
+        Raises:
+            OutputError: if the file could not be written.
+
+        """
+        if self._worker is None:
+            return
+        worker, self._worker = self._worker, None
+        last = worker.submit(self._finish)
+        worker.shutdown(wait=True)
+        for job in [*self._jobs, last]:
+            error = job.exception()
+            if isinstance(error, OSError | RuntimeError):
+                raise OutputError(f"cannot write the recording {self.path}: {error}") from error
+            if error is not None:
+                raise error
+
+    def _submit(self, job: Any, *arguments: Any) -> None:
+        if self._worker is None:
+            raise ValueError("the recording is closed")
+        self._jobs.append(self._worker.submit(job, *arguments))
+
+    def _open(self, budget: int, seed: int) -> None:
+        from mtpcr_geo.export.recording.writer import RecordingWriter
+
+        self._writer = RecordingWriter(self.path, budget, seed)
+
+    def _finish(self) -> None:
+        if self._writer is not None:
+            self._writer.close()

@@ -1,0 +1,397 @@
+"""What goes into a recording, stage by stage, and under which name. Needs rerun; imported late."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from mtpcr_geo import __version__
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.cloud import Cloud
+from mtpcr_geo.core.types import Floats, Pair, Side
+from mtpcr_geo.export import descriptions, drawing
+from mtpcr_geo.export.recording import matching
+from mtpcr_geo.export.recording.layout import TIMELINE, Recorded, layout
+from mtpcr_geo.export.tie_points import footprints, tie_positions
+
+APPLICATION = "mtpcr_geo"
+_ROLE_RGB = {"source": drawing.SOURCE_RGB, "target": drawing.TARGET_RGB}
+_IMAGE_SIDE = 2048
+_KINDS = ("disagreeing", "agreeing", "withheld", "unjudged")
+
+
+class RecordingWriter:
+    """Logs a run to an open rerun file. All calls come from one thread.
+
+    Args:
+        path: the `.rrd` to write.
+        budget: points a cloud and picture at most.
+        seed: of the thinning.
+
+    """
+
+    def __init__(self, path: Path, budget: int, seed: int) -> None:
+        self.budget = budget
+        self.seed = seed
+        self._recorded = Recorded()
+        self._seen: dict[str, object] = {}
+        self._stage = 0
+        self._pen = matching.Pen(self._log, self._log_image)
+        self._stages: list[tuple[str, str, float]] = []
+        self._options: dict[str, dict[str, Any]] = {}
+        self._properties: dict[str, Any] = {}
+        self._side_texts: dict[str, str] = {}
+        self._pair: Pair | None = None
+        self._stream = rr.RecordingStream(APPLICATION, send_properties=False)
+        # one clock only: the stages
+        rr.set_log_time_enabled(False, recording=self._stream)
+        rr.set_log_tick_enabled(False, recording=self._stream)
+        self._stream.save(path)
+        for root in ("input/source", "input/target", "levelled", "aligned"):
+            self._stream.log(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+    def begin(self, properties: Mapping[str, Any]) -> None:
+        """Send what holds for the whole run as recording properties."""
+        self._properties = dict(properties)
+        self._stream.send_recording_name("mtpcr_geo run")
+        self._send_properties("program", {"name": APPLICATION, "version": __version__})
+        for name, value in properties.items():
+            if isinstance(value, Mapping):
+                self._send_properties(name, value)
+            elif name == "inputs" and isinstance(value, list):
+                for number, one in enumerate(value, start=1):
+                    self._send_properties(f"input_{number}", one)
+            elif name == "pipeline" and isinstance(value, list):
+                self._send_properties(name, {str(one.get("tag", i)): one for i, one in enumerate(value)})
+            elif isinstance(value, str):
+                self._send_properties(name, {"value": value})
+        self._stream.log("run", self._markdown(self._run_text()), static=True)
+
+    def after(
+        self, stage_type: str, tag: str, options: dict[str, Any], value: object, seconds: float
+    ) -> None:
+        """Log a finished stage: a line, its seconds, and whatever it newly made."""
+        self._stream.set_time(TIMELINE, sequence=self._stage)
+        self._stages.append((tag, stage_type, seconds))
+        self._options[tag] = options
+        made = _made(value, self._pair)
+        if isinstance(value, Pair):
+            self._log_pair(value)
+        bad = "verdict" in made and "accepted" not in made
+        level = rr.TextLogLevel.WARN if bad else rr.TextLogLevel.INFO
+        line = f"{tag} ({stage_type}), {seconds:.2f} s: {made}"
+        self._log("stages", rr.TextLog(line, level=level))
+        self._log("seconds", rr.Scalars(seconds))
+        self._log("summary", self._markdown(self._summary()))
+        self._stage += 1
+
+    def close(self) -> None:
+        """Send the layout and finish the file."""
+        self._stream.log("run", self._markdown(self._run_text()), static=True)
+        self._stream.send_blueprint(layout(self._recorded), make_active=True, make_default=True)
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def _log_pair(self, pair: Pair) -> None:
+        self._pair = pair
+        sides = [pair.target] if pair.source is pair.target else [pair.source, pair.target]
+        if self._new("frame", pair.frame):
+            self._log_frame(pair, sides)
+        for side in sides:
+            if self._new(f"sample {side.role}", side.sample):
+                self._log_input(side)
+            if self._new(f"level {side.role}", side.T_level_work):
+                self._log_levelled(side)
+            if side.bev is not None and self._new(f"bev {side.role}", side.bev):
+                self._log_bev(side)
+            if self._new(f"appearance {side.role}", side.appearance):
+                matching.log_appearance(self._pen, side)
+        if pair.matches is not None and self._new("hypotheses", pair.matches):
+            self._log_hypotheses(pair)
+            matching.log_keypoints(self._pen, pair)
+            matching.log_sweep(self._pen, pair)
+            matching.log_focus(self._pen, pair)
+        state = (pair.matches, pair.ties, pair.T_target_source is None)
+        if pair.matches is not None and self._new("matches", state):
+            self._log_matches(pair)
+        if pair.T_target_source is not None:
+            moved = self._new("transform", pair.T_target_source)
+            if moved:
+                self._log_aligned(pair)
+            if pair.ties is not None and (self._new("ties", pair.ties) or moved):
+                self._log_ties(pair)
+            if moved and pair.frame.crs is not None:
+                self._log_map(pair)
+
+    def _log_frame(self, pair: Pair, sides: list[Side]) -> None:
+        names = [Path(side.cloud.name).name for side in sides]
+        self._stream.send_recording_name(" to ".join(names))
+        crs = pair.frame.crs
+        frame = {
+            "crs": crs.name if crs is not None else "local",
+            "crs_wkt": crs.to_wkt() if crs is not None else "",
+            "origin_m": " ".join(f"{value:.17g}" for value in pair.frame.origin),
+        }
+        for side in sides:
+            frame[f"{side.role}_origin_m"] = " ".join(f"{value:.17g}" for value in side.link.origin)
+            own = side.link.file_crs
+            frame[f"{side.role}_crs"] = own.name if own is not None else "local"
+        self._send_properties("frame", frame)
+
+    def _log_input(self, side: Side) -> None:
+        xyz = self._thin(side.sample, self.budget)
+        colours = drawing.height_colours(xyz[:, 2], *drawing.height_range(xyz[:, 2]))
+        self._log_points(f"input/{side.role}", xyz, colours, root=f"input/{side.role}")
+
+    def _log_levelled(self, side: Side) -> None:
+        xyz = transforms.apply(side.T_level_work, self._thin(side.sample, self.budget // 2))
+        self._log_points(f"levelled/{side.role}", xyz, _tinted(xyz, side.role), root="levelled")
+
+    def _log_bev(self, side: Side) -> None:
+        bev = side.bev
+        assert bev is not None
+        path = f"bev/{side.role}"
+        top, cell, _ = drawing.thinned(bev, _IMAGE_SIDE)
+        self._log_image(f"{path}/relief", drawing.shaded_relief(top, cell))
+        self._log_image(f"{path}/bandpass", drawing.band_grey(top, cell))
+        top = np.ascontiguousarray(top)
+        low, high = drawing.height_range(top[np.isfinite(top)])
+        image = rr.DepthImage(top, meter=1.0, colormap="viridis", depth_range=(low, high))
+        self._log(f"{path}/height", image)
+        self._recorded.images[f"{path}/height"] = (top.shape[1], top.shape[0])
+
+    def _log_hypotheses(self, pair: Pair) -> None:
+        assert pair.matches is not None
+        if not pair.matches.hypotheses:
+            return
+        scores = np.array([one.score for one in pair.matches.hypotheses], np.float64)
+        ranks = np.arange(len(scores), dtype=np.float64) + 0.5  # a bar's left edge
+        self._log("hypotheses/scores", rr.BarChart(scores, abscissa=ranks, color=drawing.UNJUDGED_RGB))
+        head = ("rank", "yaw", "shift", "score", "overlap")
+        self._log(
+            "hypotheses/table",
+            self._markdown(descriptions.markdown_table(head, descriptions.hypothesis_rows(pair))),
+        )
+
+    def _log_matches(self, pair: Pair) -> None:
+        if pair.source.bev is None or pair.target.bev is None:
+            return
+        picture, ends, colours, kind = drawing.match_lines(pair)
+        scale = min(1.0, _IMAGE_SIDE / max(picture.shape[:2]))
+        if self._new("matches picture", (pair.source.bev, pair.target.bev)):
+            self._log_image("matches/image", picture)
+        self._recorded.images["matches"] = self._recorded.images["matches/image"]
+        ends = (ends + 0.5) * scale  # rerun's pixels have their centres at halves
+        for number, name in enumerate(_KINDS):
+            chosen = kind == number
+            path = f"matches/{name}"
+            if not chosen.any():
+                if path in self._recorded.paths:
+                    self._stream.log(path, rr.Clear(recursive=True))
+                continue
+            width = rr.Radius.ui_points(0.8 if number else 0.5)
+            order = 20.0 + number
+            lines = rr.LineStrips2D(ends[chosen], colors=colours[chosen], radii=width, draw_order=order)
+            self._log(f"{path}/lines", lines)
+            spots = rr.Points2D(
+                ends[chosen].reshape(-1, 2),
+                colors=np.repeat(colours[chosen], 2, axis=0),
+                radii=rr.Radius.ui_points(2.0),
+                draw_order=order + 10.0,
+            )
+            self._log(f"{path}/ends", spots)
+            self._recorded.paths.add(path)
+
+    def _log_aligned(self, pair: Pair) -> None:
+        T = pair.T_target_source
+        assert T is not None
+        if self._new("aligned", pair.source.sample):
+            for side in (pair.source, pair.target):
+                xyz = self._thin(side.sample, self.budget)
+                self._log_points(f"aligned/{side.role}/points", xyz, _tinted(xyz, side.role))
+        self._log("aligned/source", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+        placed = transforms.apply(T, self._thin(pair.source.sample, 10_000))
+        self._recorded.bounds["aligned"] = _bounds(placed)
+
+    def _log_ties(self, pair: Pair) -> None:
+        target, registered = tie_positions(pair)
+        ties = pair.ties
+        assert registered is not None
+        assert ties is not None
+        if len(target) == 0:
+            return
+        residual = np.linalg.norm(registered - target, axis=1)
+        colours = drawing.residual_colours(residual, *drawing.residual_limits(residual, ties.inlier))
+        points = rr.Points3D(target, colors=colours, radii=rr.Radius.ui_points(5.0))
+        self._log("aligned/ties", points)
+        lines = rr.LineStrips3D(
+            np.stack([registered, target], axis=1), colors=colours, radii=rr.Radius.ui_points(1.5)
+        )
+        self._log("aligned/links", lines)
+        values = rr.AnyValues(
+            residual_m=residual, score=ties.score, withheld=ties.withheld, inlier=ties.inlier
+        )
+        self._log("aligned/ties", values)
+        top = max(float(np.percentile(residual, 95)), 0.05)
+        counts, edges = np.histogram(np.clip(residual, 0.0, top), bins=30, range=(0.0, top))
+        left_cm = 100.0 * edges[:-1]
+        widths = np.full(len(counts), 100.0 * (edges[1] - edges[0]), np.float32)
+        chart = rr.BarChart(
+            counts.astype(np.float64), abscissa=left_cm, widths=widths, color=drawing.GOOD_RGB
+        )
+        self._log("residuals", chart)
+
+    def _log_map(self, pair: Pair) -> None:
+        from pyproj import Transformer
+
+        assert pair.T_target_source is not None
+        to_geographic = Transformer.from_crs(pair.frame.crs, "EPSG:4326", always_xy=True)
+        for role, work_ring in footprints(pair).items():
+            ring = work_ring + pair.frame.origin[:2]
+            longitude, latitude = to_geographic.transform(ring[:, 0], ring[:, 1])
+            if not np.isfinite(longitude).all():
+                continue
+            line = rr.GeoLineStrings(
+                lat_lon=[np.column_stack([latitude, longitude])],
+                colors=[_ROLE_RGB[role]],
+                radii=rr.Radius.ui_points(2.0),
+            )
+            self._log(f"map/{role}", line)
+
+    def _log_points(
+        self, path: str, xyz: Floats, colours: NDArray[np.uint8], root: str | None = None
+    ) -> None:
+        points = rr.Points3D(xyz.astype(np.float32), colors=colours, radii=rr.Radius.ui_points(0.9))
+        self._log(path, points)
+        if root is not None and len(xyz):
+            bounds = _bounds(xyz)
+            known = self._recorded.bounds.get(root)
+            if known is not None:
+                bounds = np.array([np.minimum(known[0], bounds[0]), np.maximum(known[1], bounds[1])])
+            self._recorded.bounds[root] = bounds
+
+    def _log_image(self, path: str, picture: drawing.Picture) -> None:
+        picture = drawing.fit(picture, _IMAGE_SIDE)
+        self._recorded.images[path] = (picture.shape[1], picture.shape[0])
+        self._log(path, rr.EncodedImage(contents=drawing.jpeg(picture), media_type="image/jpeg"))
+
+    def _log(self, path: str, what: Any) -> None:
+        self._stream.log(path, what)
+        self._recorded.paths.add(path)
+
+    def _new(self, what: str, value: object) -> bool:
+        """Whether a value differs from the last one of that name; the last is kept alive to compare."""
+        last = self._seen.get(what)
+        if isinstance(value, tuple) and isinstance(last, tuple):
+            same = all(a is b for a, b in zip(value, last, strict=True))
+        else:
+            same = last is value
+        self._seen[what] = value
+        return not same
+
+    def _thin(self, xyz: Floats, budget: int) -> Floats:
+        if len(xyz) <= budget:
+            return xyz
+        # one point from each of `budget` equal runs: in file order, without repeats, not on a beat
+        jitter = np.random.default_rng(self.seed).random(budget)
+        return xyz[((np.arange(budget) + jitter) * (len(xyz) / budget)).astype(np.int64)]
+
+    def _send_properties(self, name: str, values: Mapping[str, Any]) -> None:
+        texts = {str(key).replace("-", "_"): descriptions.plain(value) for key, value in values.items()}
+        texts = {key: text for key, text in texts.items() if text}
+        if texts:
+            self._stream.send_property(name.replace("-", "_"), rr.AnyValues(**texts))
+
+    @staticmethod
+    def _markdown(text: str) -> Any:
+        return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+
+    def _summary(self) -> str:
+        pair = self._pair
+        parts = []
+        if pair is not None and pair.verdict is not None:
+            parts.append(
+                f"# {pair.verdict.name.capitalize()}\n\n{descriptions.verdict_meaning(pair.verdict)}"
+            )
+            parts.append("\n".join(f"- {reason}" for reason in pair.verdict.reasons))
+        else:
+            parts.append("# Not judged yet")
+        if pair is not None:
+            rows = descriptions.transform_rows(pair)
+            if rows:
+                parts.append("## Transform\n\n" + descriptions.markdown_table(("what", "value"), rows))
+            if pair.verdict is not None and pair.verdict.metrics:
+                table = descriptions.markdown_table(
+                    ("check", "value"), descriptions.metric_rows(pair.verdict.metrics)
+                )
+                parts.append("## Checks\n\n" + table)
+            for side in [pair.target] if pair.source is pair.target else [pair.source, pair.target]:
+                if self._new(f"rows {side.role}", side):
+                    self._side_texts[side.role] = descriptions.markdown_table(
+                        ("what", "value"), descriptions.side_rows(side)
+                    )
+                parts.append(f"## {side.role.capitalize()}\n\n{self._side_texts[side.role]}")
+        rows = [(tag, f"{seconds:.2f} s") for tag, _, seconds in self._stages]
+        parts.append("## Time\n\n" + descriptions.markdown_table(("stage", "time"), rows))
+        return "\n\n".join(parts)
+
+    def _run_text(self) -> str:
+        parts = []
+        if self._options:
+            rows = [(tag, descriptions.plain(options)) for tag, options in self._options.items()]
+            parts.append("## Options\n\n" + descriptions.markdown_table(("stage", "options"), rows))
+        for name in ("inputs", "versions"):
+            value = self._properties.get(name)
+            if isinstance(value, Mapping):
+                rows = [(str(key), descriptions.plain(one)) for key, one in value.items()]
+                parts.append(
+                    f"## {name.capitalize()}\n\n" + descriptions.markdown_table(("what", "value"), rows)
+                )
+            elif isinstance(value, list):
+                parts.append(
+                    f"## {name.capitalize()}\n\n" + "\n".join(f"- {descriptions.plain(v)}" for v in value)
+                )
+        return "\n\n".join(parts) or "nothing was noted"
+
+
+def _made(value: object, before: Pair | None) -> str:
+    """Say in some words what a stage newly made."""
+    if isinstance(value, Cloud):
+        return f"a cloud of {value.count:,} points, {Path(value.name).name}"
+    if not isinstance(value, Pair):
+        return "done"
+    if before is None:
+        return "both clouds in their work frames"
+    found = []
+    if value.target.bev is not None and value.target.bev is not before.target.bev:
+        found.append(f"rasters of {value.target.bev.grid.cell:g} m cells")
+    if value.matches is not None and value.matches is not before.matches:
+        found.append(f"{len(value.matches.score)} matches")
+    if value.ties is not None and value.ties is not before.ties:
+        found.append(f"{len(value.ties.score)} ties, {int(np.sum(value.ties.inlier))} agreeing")
+    if value.T_target_source is not None and value.T_target_source is not before.T_target_source:
+        found.append("a transform")
+    if value.verdict is not None and value.verdict is not before.verdict:
+        found.append(f"verdict {value.verdict.name}")
+    return ", ".join(found) or "done"
+
+
+def _bounds(xyz: Floats) -> Floats:
+    """(2, 3) bounds of the middle 98 % in plan, so that stray points do not shrink the first look."""
+    if len(xyz) == 0:
+        return np.zeros((2, 3))
+    return np.asarray(np.percentile(xyz[:: max(1, len(xyz) // 20_000)], [1.0, 99.0], axis=0))
+
+
+def _tinted(xyz: Floats, role: str) -> NDArray[np.uint8]:
+    """Colour points by role, darker below and lighter above, so that shapes show."""
+    low, high = drawing.height_range(xyz[:, 2])
+    place = np.clip((xyz[:, 2:3] - low) / (high - low), 0.0, 1.0).astype(np.float32)
+    colour = np.array(_ROLE_RGB[role], np.float32)
+    lit = colour * (0.45 + 0.55 * place) + 70.0 * place**2
+    return np.asarray(np.clip(lit, 0, 255), np.uint8)

@@ -1,0 +1,176 @@
+"""One streamed look at a whole cloud: is it sound, where does it lie, and a sample to work on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud
+from mtpcr_geo.core.errors import InputError
+
+if TYPE_CHECKING:
+    from mtpcr_geo.pipeline.stage import Progress
+
+BUDGET = 4_000_000
+FEWEST_POINTS = 100
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What one pass over a cloud found.
+
+    Attributes:
+        count: points in the cloud.
+        dropped: of these, points classified as noise (7, 18) or flagged withheld; not in the sample.
+        minimum, maximum: (3,) true bounds of all other points, in file coordinates.
+        sample: (n, 3) float64 file coordinates, in file order.
+        complete: whether the sample is the whole cloud but for the dropped points.
+
+    """
+
+    count: int
+    dropped: int
+    minimum: Floats
+    maximum: Floats
+    sample: Floats
+    complete: bool
+
+
+def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progress | None = None) -> Scan:
+    """Stream a cloud once: check it, bound it, and keep a uniform random sample of it.
+
+    The sample depends on the seed, not on how the cloud was cut into chunks. It is the whole cloud
+    where that fits the budget. Memory is about 40 bytes a point of the budget, whatever the cloud's size.
+
+    Args:
+        cloud: what to look at.
+        budget: most points to keep.
+        seed: of the random choice.
+        progress: where to report the points read.
+
+    Raises:
+        InputError: if the cloud is empty, damaged, not finite, or too poor to be registered.
+
+    """
+    if cloud.count == 0:
+        raise InputError(f"{cloud.name} is empty (0 points); give a cloud with points")
+    kept = _Subset(cloud.count, budget, seed)
+    count, dropped = 0, 0
+    minimum, maximum = np.full(3, np.inf), np.full(3, -np.inf)
+    task: Any = nullcontext(lambda n: None)
+    if progress is not None:
+        task = progress.task(f"reading {cloud.name}", cloud.count)
+    with task as advance:
+        for xyz, noise in cloud.noise_chunks():
+            _check_finite(cloud, xyz, count)
+            count += len(xyz)
+            good = xyz[~noise] if noise.any() else xyz
+            dropped += len(xyz) - len(good)
+            if len(good):
+                np.minimum(minimum, good.min(axis=0), out=minimum)
+                np.maximum(maximum, good.max(axis=0), out=maximum)
+                kept.add(good)
+            advance(len(xyz))
+    _check_usable(cloud, count, dropped, minimum, maximum)
+    sample = kept.result()
+    return Scan(count, dropped, minimum, maximum, sample, complete=len(sample) == count - dropped)
+
+
+def surface_chunks(cloud: Cloud, size: int = CHUNK_POINTS) -> Iterator[Floats]:
+    """Stream the whole cloud as `scan` sees it: (n, 3) float64 file coordinates, noise left out.
+
+    Raises:
+        InputError: if the file is truncated or damaged.
+
+    """
+    for xyz, noise in cloud.noise_chunks(size):
+        good = xyz[~noise] if noise.any() else xyz
+        if len(good):
+            yield good
+
+
+class _Subset:
+    """Uniform random subset of a stream: the points with the smallest random keys, in stream order."""
+
+    def __init__(self, count: int, budget: int, seed: int) -> None:
+        self.budget = budget
+        self.rng = np.random.default_rng(seed) if count > budget else None
+        self.bound = 1.0
+        room = min(count, budget + max(CHUNK_POINTS, budget // 4))
+        self.points = np.empty((room, 3))
+        self.keys = np.empty(room if self.rng is not None else 0)
+        self.size = 0
+
+    def add(self, xyz: Floats) -> None:
+        keys: Floats | None = None
+        if self.rng is not None:
+            keys = self.rng.random(len(xyz))
+            chosen = keys < self.bound
+            xyz, keys = xyz[chosen], keys[chosen]
+        start = 0
+        while start < len(xyz):
+            if self.size == len(self.points):
+                self._thin()
+            n = min(len(xyz) - start, len(self.points) - self.size)
+            self.points[self.size : self.size + n] = xyz[start : start + n]
+            if keys is not None:
+                self.keys[self.size : self.size + n] = keys[start : start + n]
+            self.size += n
+            start += n
+
+    def _thin(self) -> None:
+        if self.rng is None:
+            # more points than the header promised
+            self.points = np.concatenate([self.points, np.empty_like(self.points)])
+            return
+        keys = self.keys[: self.size]
+        # keys are 53 bit random numbers: ties are possible in theory, hence the cut by rank
+        chosen = np.sort(np.argpartition(keys, self.budget)[: self.budget])
+        self.bound = float(keys[chosen].max())
+        self.points[: self.budget] = self.points[chosen]
+        self.keys[: self.budget] = keys[chosen]
+        self.size = self.budget
+
+    def result(self) -> Floats:
+        if self.rng is not None and self.size > self.budget:
+            self._thin()
+        return self.points[: self.size].copy() if self.size < len(self.points) else self.points
+
+
+def _check_finite(cloud: Cloud, xyz: Floats, before: int) -> None:
+    if np.isfinite(xyz.sum()):
+        return
+    bad = ~np.isfinite(xyz).all(axis=1)
+    if bad.any():
+        first = before + int(bad.argmax())
+        raise InputError(
+            f"{cloud.name} has coordinates that are not finite (first at point {first}); "
+            "remove those points, or check the header's scales and offsets"
+        )
+
+
+def _check_usable(cloud: Cloud, count: int, dropped: int, minimum: Floats, maximum: Floats) -> None:
+    good = count - dropped
+    if good == 0:
+        raise InputError(
+            f"every point of {cloud.name} is classified as noise or withheld; "
+            "reclassify it or give another cloud"
+        )
+    extent = maximum - minimum
+    if count == 1:
+        raise InputError(f"{cloud.name} holds one point only; give a cloud of a place")
+    if not extent.any():
+        raise InputError(f"all {good} points of {cloud.name} are at the same place; check how it was written")
+    if extent[0] == 0 or extent[1] == 0:
+        raise InputError(f"{cloud.name} has no area seen from above; check its axes")
+    if good < FEWEST_POINTS:
+        raise InputError(
+            f"{cloud.name} has {good} usable points; at least {FEWEST_POINTS} are needed, "
+            "and many more for a trustworthy result"
+        )

@@ -1,0 +1,159 @@
+"""Clouds seen through something: cropped, cut short, moved. Nothing is held; points stream through."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
+from mtpcr_geo.core.types import Pair
+from mtpcr_geo.crs import TransformChain
+
+Floats = NDArray[np.float64]
+Box = tuple[tuple[float, float], ...]
+
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_RANGE = re.compile(rf"\[\s*({_NUMBER})\s*,\s*({_NUMBER})\s*\]")
+_BOUNDS = re.compile(rf"\(\s*{_RANGE.pattern}(?:\s*,\s*{_RANGE.pattern}){{1,2}}\s*\)\Z")
+
+
+def parse_bounds(text: str) -> Box:
+    """Read PDAL's bounds ``([xmin, xmax], [ymin, ymax])``, with or without ``[zmin, zmax]``.
+
+    Raises:
+        ValueError: if it is none.
+
+    """
+    text = text.strip()
+    if not _BOUNDS.match(text):
+        raise ValueError('bounds are written "([xmin, xmax], [ymin, ymax])", with [zmin, zmax] for height')
+    box = tuple((float(low), float(high)) for low, high in _RANGE.findall(text))
+    if any(low > high for low, high in box):
+        raise ValueError("a minimum of the bounds is above its maximum")
+    return box
+
+
+def xyz_of(table: PointTable) -> Floats:
+    """Give the (n, 3) float64 coordinates of a table of points."""
+    return np.stack([np.asarray(table[axis], np.float64) for axis in "XYZ"], axis=1)
+
+
+class View(Cloud):
+    """A cloud that shows some of another one's points.
+
+    Subclasses say which; the bounds and the count are found by one pass.
+    """
+
+    def __init__(self, base: Cloud) -> None:
+        self.base = base
+        self.name = base.name
+        self.crs = base.crs
+        self.count = 0
+        self.minimum = np.full(3, np.inf)
+        self.maximum = np.full(3, -np.inf)
+        for xyz in self.xyz_chunks():
+            self.count += len(xyz)
+            self.minimum = np.minimum(self.minimum, xyz.min(axis=0))
+            self.maximum = np.maximum(self.maximum, xyz.max(axis=0))
+
+    def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
+        """Yield (n, 3) float64 coordinates in the cloud's own CRS and units, n <= size."""
+        for xyz, keep in self._masked((xyz, xyz) for xyz in self.base.xyz_chunks(size)):
+            if keep.any():
+                yield xyz[keep]
+
+    def table_chunks(self, size: int = CHUNK_POINTS) -> Iterator[PointTable]:
+        """Yield tables of all dimensions by PDAL name, n <= size rows each."""
+        pairs: Iterator[tuple[PointTable, Floats]] = (
+            (table, xyz_of(table)) for table in self.base.table_chunks(size)
+        )
+        for table, keep in self._masked(pairs):
+            if keep.any():
+                yield {name: values[keep] for name, values in table.items()}
+
+    def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, NDArray[np.bool_]]]:
+        """Yield coordinates (n, 3) and which of them are noise or withheld (n,), n <= size."""
+        chunks = (((xyz, noise), xyz) for xyz, noise in self.base.noise_chunks(size))
+        for (xyz, noise), keep in self._masked(chunks):
+            if keep.any():
+                yield xyz[keep], noise[keep]
+
+    def _masked(self, chunks: Iterable[tuple[Any, Floats]]) -> Iterator[tuple[Any, NDArray[np.bool_]]]:
+        raise NotImplementedError
+
+
+class Cropped(View):
+    """The points within any of some boxes, edges included; or those outside all of them."""
+
+    def __init__(self, base: Cloud, boxes: Sequence[Box], outside: bool = False) -> None:
+        self.boxes = tuple(boxes)
+        self.outside = outside
+        super().__init__(base)
+
+    def _masked(self, chunks: Iterable[tuple[Any, Floats]]) -> Iterator[tuple[Any, NDArray[np.bool_]]]:
+        for chunk, xyz in chunks:
+            keep = np.zeros(len(xyz), bool)
+            for box in self.boxes:
+                inside = np.ones(len(xyz), bool)
+                for axis, (low, high) in enumerate(box):
+                    inside &= (xyz[:, axis] >= low) & (xyz[:, axis] <= high)
+                keep |= inside
+            yield chunk, ~keep if self.outside else keep
+
+
+class Head(View):
+    """The first points of a cloud."""
+
+    def __init__(self, base: Cloud, first: int) -> None:
+        self.first = first
+        super().__init__(base)
+
+    def _masked(self, chunks: Iterable[tuple[Any, Floats]]) -> Iterator[tuple[Any, NDArray[np.bool_]]]:
+        left = self.first
+        for chunk, xyz in chunks:
+            yield chunk, np.arange(len(xyz)) < left
+            left -= len(xyz)
+            if left <= 0:
+                return
+
+
+class Moved(Cloud):
+    """The source of a registration, brought to the target: in the target's CRS and units.
+
+    Points stream through the work frame, so that no digits are lost far from the origin. The bounds
+    enclose the cloud, and may be wider than it.
+
+    Attributes:
+        base: the source cloud.
+
+    """
+
+    def __init__(self, pair: Pair) -> None:
+        self.base = pair.source.cloud
+        self._chain = TransformChain.of(pair)
+        self.name = self.base.name
+        self.crs = self._chain.target.file_crs
+        self.count = self.base.count
+        axes = np.stack([self.base.minimum, self.base.maximum], axis=1)
+        moved = self.move(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
+        self.minimum, self.maximum = moved.min(axis=0), moved.max(axis=0)
+
+    def move(self, xyz: Floats) -> Floats:
+        """Take (n, 3) source file coordinates to (n, 3) target file coordinates."""
+        return self._chain.forward(xyz)
+
+    def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
+        """Yield (n, 3) float64 coordinates in the target's CRS and units, n <= size."""
+        for xyz in self.base.xyz_chunks(size):
+            yield self.move(xyz)
+
+    def table_chunks(self, size: int = CHUNK_POINTS) -> Iterator[PointTable]:
+        """Yield tables of all dimensions by PDAL name, n <= size rows each."""
+        for table in self.base.table_chunks(size):
+            xyz = self.move(xyz_of(table))
+            moved: PointTable = {axis: xyz[:, i] for i, axis in enumerate("XYZ")}
+            yield {**table, **moved}

@@ -1,0 +1,187 @@
+"""Writing clouds as LAS 1.4, LAZ or COPC, streamed, with every dimension and extra byte kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import laspy
+import lazrs
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo.core.cloud import Cloud
+from mtpcr_geo.core.errors import OutputError
+from mtpcr_geo.io.las import LasCloud
+from mtpcr_geo.io.layout import layout
+from mtpcr_geo.io.waveform import append_waveforms
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+    from mtpcr_geo.pipeline.stage import Progress
+
+Floats = NDArray[np.float64]
+Move = Callable[[Floats], Floats]
+STEP, FINEST_STEP = 0.001, 0.0001  # metres or feet
+DEGREE_STEP = 1e-9  # a tenth of a millimetre, and 32 bits still span four degrees
+_METRES_A_DEGREE = 1e5
+_INT32 = 2**31 - 1
+
+
+def write_cloud(
+    path: Path,
+    cloud: Cloud,
+    move: Move | None,
+    crs: CRS | None,
+    scale: float | tuple[float, float, float] | None = None,
+    progress: Progress | None = None,
+    advance: Callable[[int], object] | None = None,
+) -> None:
+    """Write a cloud, its coordinates moved on the way.
+
+    LAS 1.4 in the point format from 6 up that holds all there is; the CRS as WKT; records that are
+    neither about the CRS nor about the file's layout are kept. Memory does not grow with the number
+    of points; COPC, which has to be sorted, spools to a temporary file beside the output.
+
+    Args:
+        path: where to write; ``.las``, ``.laz`` or ``.copc.laz`` says the format.
+        cloud: what to write.
+        move: takes (n, 3) file coordinates of `cloud` to those to be written; None leaves them.
+        crs: CRS of the written coordinates; None states none.
+        scale: size of the last digit, in units of `crs`; None takes 0.001, or the input's own if that is
+            finer, down to 0.0001. For geographic coordinates 1e-9 degrees.
+        progress: where to report the points written.
+        advance: is called with the number of points of each chunk written.
+
+    Raises:
+        OutputError: if the file cannot be written, or the coordinates do not fit the scale.
+        InputError: if the cloud cannot be read.
+
+    """
+    task: Any = nullcontext(lambda n: None)
+    if progress is not None:
+        task = progress.task(f"writing {path.name}", cloud.count)
+    header, chunks = layout(cloud, crs)
+    with task as report:
+
+        def told(count: int) -> None:
+            report(count)
+            if advance is not None:
+                advance(count)
+
+        placed = _placed(header, chunks, move, _scales(cloud, crs, scale), told)
+        try:
+            if is_copc(path):
+                from mtpcr_geo.io.copc import write_copc
+
+                write_copc(path, header, placed)
+            else:
+                _write_las(path, header, placed)
+                if isinstance(cloud, LasCloud):
+                    append_waveforms(path, cloud)
+        except (OSError, lazrs.LazrsError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise OutputError(
+                f"cannot write in {path.parent}: {reason}; check rights and free space"
+            ) from error
+
+
+def is_copc(path: Path) -> bool:
+    """Tell by its name whether a file shall be COPC: ``.copc.laz``, also while it has its passing name."""
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    return suffixes[-1:] == [".laz"] and ".copc" in suffixes
+
+
+def returning_scales(cloud: Cloud, crs: CRS | None) -> Floats:
+    """Choose scales (3,) fine enough that a cloud can be moved, written, and moved back onto its own digits.
+
+    A rotation puts up to 1.4 steps of error on a coordinate by there and back, so the step is a tenth of
+    the input's, within 0.00001 and 0.001 metres (or feet), as long as the cloud's extent allows it.
+    """
+    scales = np.full(3, STEP)
+    if isinstance(cloud, LasCloud):
+        scales = np.asarray(cloud.header.scales, np.float64) / 10
+        if cloud.crs is not None and cloud.crs.is_geographic:
+            scales[:2] *= _METRES_A_DEGREE
+        scales = np.clip(scales, FINEST_STEP / 10, STEP)
+    extent = cloud.maximum - cloud.minimum
+    if cloud.crs is None or not cloud.crs.is_geographic:
+        while np.isfinite(extent).all() and scales.min() < STEP and extent.max() / scales.min() > _INT32:
+            scales = np.minimum(scales * 10, STEP)
+    if crs is not None and crs.is_geographic:
+        scales[:2] = np.minimum(scales[:2] / _METRES_A_DEGREE, DEGREE_STEP)
+    return scales
+
+
+def _write_las(path: Path, header: laspy.LasHeader, chunks: Iterator[NDArray[Any]]) -> None:
+    compress = path.suffix.lower() == ".laz"
+    if compress and header.point_format.has_waveform_packet:
+        chunks = _of_one_channel(chunks)
+    # the first chunk settles the offsets, which the header needs before anything is written
+    first = next(chunks, None)
+    with laspy.open(path, mode="w", header=header, do_compress=compress) as writer:
+        if first is not None:
+            writer.write_points(laspy.PackedPointRecord(first, header.point_format))
+        for chunk in chunks:
+            writer.write_points(laspy.PackedPointRecord(chunk, header.point_format))
+        if header.evlrs:
+            writer.write_evlrs(header.evlrs)
+
+
+def _of_one_channel(chunks: Iterator[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+    """Pass on points with waveforms, unless their scanner channels are mixed.
+
+    lazrs up to 0.8 garbles the wave packets of such points without a word.
+    """
+    seen: set[int] = set()
+    for chunk in chunks:
+        seen |= set(np.unique(chunk["classification_flags"] >> 4 & 3).tolist())
+        if len(seen) > 1:
+            raise OutputError(
+                "waveforms of several scanner channels cannot be compressed reliably; name the output .las"
+            )
+        yield chunk
+
+
+def _scales(cloud: Cloud, crs: CRS | None, said: float | tuple[float, float, float] | None) -> Floats:
+    if said is not None:
+        return np.broadcast_to(np.asarray(said, np.float64), 3).copy()
+    scales = np.full(3, STEP)
+    if isinstance(cloud, LasCloud) and not (cloud.crs is not None and cloud.crs.is_geographic):
+        scales = np.clip(cloud.header.scales, FINEST_STEP, STEP)
+    if crs is not None and crs.is_geographic:
+        scales = np.array([DEGREE_STEP, DEGREE_STEP, min(scales[2], STEP)])
+    return np.asarray(scales, np.float64)
+
+
+def _placed(
+    header: laspy.LasHeader,
+    chunks: Iterator[tuple[Floats, NDArray[Any]]],
+    move: Move | None,
+    scales: Floats,
+    advance: Callable[[int], object],
+) -> Iterator[NDArray[Any]]:
+    """Fill X, Y, Z into the packed records; the first chunk settles the header's scales and offsets."""
+    header.scales = scales
+    settled = False
+    for xyz, packed in chunks:
+        moved = xyz if move is None else move(xyz)
+        if not settled:
+            middle = (moved.min(axis=0) + moved.max(axis=0)) / 2
+            header.offsets = np.rint(middle)
+            settled = True
+        steps = np.rint((moved - header.offsets) / scales)
+        worst = float(np.abs(steps).max())
+        if not worst <= _INT32:
+            reach = float(np.abs(moved - header.offsets).max())
+            raise OutputError(
+                f"a point {reach:.0f} from the others does not fit a LAS file at scale {scales.min():g}; "
+                "give a coarser scale, or remove stray points"
+            )
+        for axis, name in enumerate("XYZ"):
+            packed[name] = steps[:, axis]
+        yield packed
+        advance(len(packed))

@@ -1,0 +1,1 @@
+"""Learned matchers through onnxruntime, and the cards that describe their models."""

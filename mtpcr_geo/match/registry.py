@@ -1,0 +1,152 @@
+"""Which matchers there are, and how one is made from its settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.types import Matches
+from mtpcr_geo.match.base import Advance, ImageMatcher, Matcher, View
+from mtpcr_geo.match.correlation import CorrelationSettings, Prior
+from mtpcr_geo.match.descriptors import Extractor, FeatureMatcher, NearestNeighbours, Orb, RootSift
+from mtpcr_geo.match.keypoints import KeypointMatcher
+from mtpcr_geo.match.learned.model_cards import ModelDescription, descriptions, models_folder, path_of
+
+BUILT_IN = ("correlation", "rootsift", "orb")
+RATIO = 0.9
+
+
+@dataclass(frozen=True)
+class KeypointSettings:
+    """What governs keypoint matchers.
+
+    Attributes:
+        models: folder of model files; the environment's if None.
+        turns: orientations tried where a matcher does not bear any angle.
+        tolerance_m: plan distance within which matches agree on an orientation; from the cells if None.
+        max_keypoints: kept of an image; the matcher's own if None.
+        tile: edge of the tiles of learned extractors, pixels; the model's own if None.
+        ratio: nearest over second nearest descriptor distance; the matcher's own if None.
+        cross_check: whether nearest neighbours must be mutual; the matcher's own if None.
+        device, threads: where and how wide onnxruntime works.
+
+    """
+
+    models: Path | None = None
+    turns: int = 8
+    tolerance_m: float | None = None
+    max_keypoints: int | None = None
+    tile: int | None = None
+    ratio: float | None = None
+    cross_check: bool | None = None
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    threads: int = 0
+
+
+@dataclass(frozen=True)
+class CorrelationMatcher:
+    """The default matcher as a `Matcher`.
+
+    Attributes:
+        settings: what governs the search.
+        prior: a pose known beforehand.
+
+    """
+
+    settings: CorrelationSettings
+    prior: Prior | None = None
+    needs_image: bool = False
+    needs_one_cell: bool = True
+
+    def match(
+        self,
+        source: View,
+        target: View,
+        *,
+        seed: int = 0,
+        yaw: float | None = None,
+        advance: Advance = lambda n: None,
+    ) -> Matches:
+        """Search all yaws and all shifts, see `Matcher.match`; a known yaw is not made use of."""
+        from mtpcr_geo.match.correlation import match
+
+        return match(source.bev, target.bev, self.settings, seed, advance, self.prior)
+
+
+def names(folder: Path | None) -> list[str]:
+    """Name all matchers, those of described models included, whether their files are there or not."""
+    return [*BUILT_IN, *descriptions(models_folder(folder))]
+
+
+def make_matcher(name: str, correlation: CorrelationSettings, keypoints: KeypointSettings) -> Matcher:
+    """Make a matcher.
+
+    Args:
+        name: what it is called.
+        correlation, keypoints: settings of either kind.
+
+    Raises:
+        OptionError: if there is none of that name, or a description is wrong.
+        MissingPartError: if a model's file is not there.
+        InputError: if a model's file is not what its description says.
+
+    """
+    if name == "correlation":
+        return CorrelationMatcher(correlation)
+    shared: dict[str, Any] = {"turns": keypoints.turns, "tolerance_m": keypoints.tolerance_m}
+    if name in ("rootsift", "orb"):
+        return KeypointMatcher(name, _classical(name, keypoints), **shared)
+    folder = models_folder(keypoints.models)
+    known = descriptions(folder)
+    if name not in known:
+        from mtpcr_geo.core.suggestions import meant
+
+        raise OptionError(f"there is no matcher {name!r}{meant(name, [*BUILT_IN, *known])}")
+    model = known[name]
+    return KeypointMatcher(
+        name,
+        _learned(model, folder, keypoints),
+        **shared,
+        magnify_to=model.extractor.magnify_to if model.extractor else 0,
+        sweep_keypoints=model.matcher.sweep_keypoints if model.matcher else None,
+    )
+
+
+def _classical(name: str, settings: KeypointSettings) -> ImageMatcher:
+    most = settings.max_keypoints or 8192
+    extractor: Extractor = RootSift(most) if name == "rootsift" else Orb(most)
+    ratio = RATIO if settings.ratio is None else settings.ratio
+    return FeatureMatcher(extractor, NearestNeighbours(ratio, bool(settings.cross_check)), any_yaw=True)
+
+
+def _learned(model: ModelDescription, folder: Path | None, settings: KeypointSettings) -> ImageMatcher:
+    from mtpcr_geo.match.learned.lightglue import FusedLightGlue, LightGlue
+    from mtpcr_geo.match.learned.onnx import OnnxExtractor, Running
+
+    running = Running(settings.device, settings.threads)
+    paths = {file: path_of(file, model, folder) for file in model.files}
+    if model.fused is not None:
+        path = paths[model.fused.file]
+        return FusedLightGlue(model.fused, path, running, any_yaw=model.any_yaw)
+    assert model.extractor is not None  # the description was checked
+    extractor = OnnxExtractor(
+        model.extractor,
+        paths[model.extractor.file],
+        running,
+        tile=settings.tile,
+        max_keypoints=settings.max_keypoints,
+    )
+    if model.matcher is not None:
+        return FeatureMatcher(
+            extractor, LightGlue(model.matcher, paths[model.matcher.file], running), model.any_yaw
+        )
+    own = model.nearest_neighbours
+    assert own is not None
+    nearest = NearestNeighbours(
+        own.ratio if settings.ratio is None else settings.ratio,
+        own.cross_check if settings.cross_check is None else settings.cross_check,
+        own.least,
+    )
+    return FeatureMatcher(extractor, nearest, model.any_yaw)

@@ -1,0 +1,234 @@
+"""Iterative closest points on the overlap, and how well surfaces meet under a transform (small_gicp)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.errors import RegistrationError
+from mtpcr_geo.method.downsample import near, thinned
+from mtpcr_geo.method.neighbourhoods import local_shapes
+from mtpcr_geo.method.overlap import overlap_of
+
+Floats = NDArray[np.float64]
+Method = Literal["gicp", "point_to_plane", "point_to_point"]
+
+_SMALL_GICP_NAMES = {"gicp": "GICP", "point_to_plane": "PLANE_ICP", "point_to_point": "ICP"}
+FEWEST_POINTS = 200
+FAR_REACH_M = (3.0, 1.5)
+NEAR_REACH_M = (1.0, 0.5)
+FINE_CELL_M = 2.0
+"""Cell of the rasters up to which reaches stand as they are; beyond it they grow in step."""
+
+STILL_RAD = 4e-6
+STILL_M = 1e-4
+NEIGHBOURS = 10
+FLAT = 4.0
+"""Times that a flat neighbourhood spreads further along its surface than across it."""
+
+JUDGES = 10_000
+MEETS_M = 0.1
+"""Gap between surfaces at which half the cost is reached that surfaces bear which do not meet at all."""
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """How a run of ICP goes about it.
+
+    Attributes:
+        reach_m: farthest correspondence of each round, metres.
+        trim_m: distance within which a point of the source must have a partner at the start to take part in
+            all rounds but the last, metres; None takes all. What grew or was built in between is left
+            out by it; the last round takes all, so that the result does not hang on the start.
+
+    """
+
+    reach_m: tuple[float, ...]
+    trim_m: float | None = None
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Where one run of ICP came to.
+
+    Attributes:
+        T: 4x4 from source to target, work coordinates.
+        rounds: reach, iterations, inliers and convergence of each round.
+
+    """
+
+    T: Floats
+    rounds: list[dict[str, Any]]
+
+
+class Surfaces:
+    """Both clouds' points in their overlap, thinned, with the directions of their surfaces.
+
+    Args:
+        source, target: (n, 3) and (m, 3) work coordinates, metres.
+        T_start: 4x4 from source to target, near the result: it tells which points lie in the overlap.
+        voxel_m: thinning, metres.
+        reach_m: farthest correspondence to be asked for, metres.
+        most_points: of the source after thinning; the target, which costs less, may have three times as many.
+        threads: for thinning and surfaces.
+
+    Raises:
+        RegistrationError: if the clouds hardly overlap under the start.
+
+    """
+
+    def __init__(
+        self,
+        source: Floats,
+        target: Floats,
+        T_start: Floats,
+        *,
+        voxel_m: float = 0.5,
+        reach_m: float = FAR_REACH_M[0],
+        most_points: int = 30_000,
+        threads: int = 2,
+    ) -> None:
+        import small_gicp
+
+        moved = transforms.apply(T_start, source)
+        overlap = overlap_of(moved, target)
+        of_source, of_target = (np.flatnonzero(overlap.select(xyz)) for xyz in (moved, target))
+        if min(len(of_source), len(of_target)) >= FEWEST_POINTS:
+            s, t = moved[of_source], target[of_target]
+            of_source, of_target = of_source[near(s, t, reach_m)], of_target[near(t, s, reach_m)]
+        if min(len(of_source), len(of_target)) < FEWEST_POINTS:
+            raise RegistrationError(
+                f"only {min(len(of_source), len(of_target))} points of one cloud lie in the overlap, "
+                "too few to refine"
+            )
+        self.T_start = T_start
+        self.voxel_m = voxel_m
+        self._threads = threads
+        self._pivot = np.floor(target[of_target].mean(axis=0))
+        # each cloud is thinned in its own frame, so that a hair's breadth at the start changes no point
+        s = transforms.apply(T_start, thinned(source[of_source], of_source, voxel_m, most_points))
+        t = thinned(target[of_target], of_target, voxel_m, 3 * most_points)
+        self._s, self._t = s - self._pivot, t - self._pivot
+        self._source, self._target = small_gicp.PointCloud(self._s), small_gicp.PointCloud(self._t)
+        self._source_tree = self._with_surfaces(self._source)
+        self._tree = self._with_surfaces(self._target)
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Points kept of source and target."""
+        return len(self._s), len(self._t)
+
+    def descend(
+        self, T_from: Floats, rounds: Rounds, *, method: Method = "gicp", iterations: int = 30
+    ) -> Descent:
+        """Run ICP from a transform, in rounds of given reach.
+
+        The optimiser runs on one thread: sums over several would differ in their last bits from run to run.
+
+        Args:
+            T_from: 4x4 from source to target, work coordinates.
+            rounds: reach of each round, and which points take part.
+            method: "gicp" (plane to plane), "point_to_plane", or "point_to_point" (the paper's citation).
+            iterations: at most, each round.
+
+        """
+        import small_gicp
+
+        X, told = self._relative(T_from), []
+        trimmed = self._source if rounds.trim_m is None else self._trimmed(X, rounds.trim_m)
+        for number, reach in enumerate(rounds.reach_m, 1):
+            # what a round leaves is taken up by the next; only the last must stand still
+            last = number == len(rounds.reach_m)
+            patience = 1.0 if last else 25.0
+            result = small_gicp.align(
+                self._target,
+                self._source if last else trimmed,
+                self._tree,
+                X,
+                registration_type=_SMALL_GICP_NAMES[method],
+                max_correspondence_distance=reach,
+                num_threads=1,
+                max_iterations=iterations,
+                rotation_epsilon=patience * STILL_RAD,
+                translation_epsilon=patience * STILL_M,
+            )
+            X = np.array(result.T_target_source)
+            told.append(
+                {
+                    "reach_m": reach,
+                    "iterations": int(result.iterations),
+                    "inliers": int(result.num_inliers),
+                    "converged": bool(result.converged),
+                }
+            )
+        X[:3, :3] = transforms.orthonormal(X[:3, :3])
+        T = transforms.translation(self._pivot) @ X @ transforms.translation(-self._pivot) @ self.T_start
+        return Descent(T, told)
+
+    def misfit(self, T: Floats) -> float:
+        """Tell how badly flat surfaces of the source meet the target: 0 all meet, 1 none does.
+
+        Each gap along the surface's normal costs ``gap^2 / (gap^2 + 0.1^2)`` (Geman and McClure), so that
+        what grew, was built or stands in one cloud only weighs alike wherever a transform puts it. The sum
+        of squares that ICP minimises has no such bound, and is smallest where a field's crop is met halfway.
+
+        Args:
+            T: 4x4 from source to target, work coordinates.
+
+        """
+        judges, normals = self._judges
+        if not len(judges):
+            return 1.0
+        X = self._relative(T)
+        moved, normal = transforms.apply(X, judges), normals @ X[:3, :3].T
+        nearest = np.asarray(self._tree.batch_knn_search(moved, 1, self._threads)[0])[:, 0].astype(np.int64)
+        gap = np.einsum("ij,ij->i", normal, self._t[nearest] - moved)
+        return float((gap**2 / (gap**2 + MEETS_M**2)).mean())
+
+    def _with_surfaces(self, cloud: Any) -> Any:
+        """Find a cloud's normals and covariances, which are stored in it, and give its tree."""
+        import small_gicp
+
+        tree = small_gicp.KdTree(cloud, self._threads)
+        small_gicp.estimate_normals_covariances(cloud, tree, NEIGHBOURS, self._threads)
+        return tree
+
+    def _trimmed(self, X: Floats, within_m: float) -> Any:
+        """Give the source's points that have a partner near by; all, where those are too few."""
+        import small_gicp
+
+        squared = np.asarray(self._tree.batch_knn_search(transforms.apply(X, self._s), 1, self._threads)[1])
+        kept = squared[:, 0] <= within_m**2
+        if kept.sum() < FEWEST_POINTS:
+            return self._source
+        cloud = small_gicp.PointCloud(self._s[kept])
+        self._with_surfaces(cloud)
+        return cloud
+
+    @cached_property
+    def _judges(self) -> tuple[Floats, Floats]:
+        """Flat places of the source, (n, 3), and their unit normals, (n, 3)."""
+        chosen = np.arange(0, len(self._s), max(len(self._s) // JUDGES, 1))
+        spread, axes = local_shapes(self._source_tree, self._s, self._s[chosen], NEIGHBOURS, self._threads)
+        flat = spread[:, 1] > FLAT * spread[:, 0]
+        return self._s[chosen[flat]], axes[flat, :, 0]
+
+    def _relative(self, T: Floats) -> Floats:
+        """Express a transform as what is left after the start, about the pivot."""
+        left = T @ transforms.inverse(self.T_start)
+        return transforms.translation(-self._pivot) @ left @ transforms.translation(self._pivot)
+
+
+def rounds_for(cell: float) -> dict[str, Rounds]:
+    """Name the runs of ICP to try on clouds rasterised at ``cell`` metres: from far, and from near.
+
+    Those from far catch starts that are off by metres. Both end in the same rounds.
+    """
+    scale = max(1.0, cell / FINE_CELL_M)
+    far, close = (tuple(scale * reach for reach in reaches) for reaches in (FAR_REACH_M, NEAR_REACH_M))
+    return {"far": Rounds((*far, *close)), "near": Rounds((*close, close[-1]), trim_m=close[0])}

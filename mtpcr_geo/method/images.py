@@ -1,0 +1,153 @@
+"""What a matcher sees: images made from a height raster.
+
+The band-passed height shows roofs, crowns and kerbs alike whatever the terrain beneath; the step edges
+show facades and eaves, which are all that a street-level scan shares with a view from above.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, get_args
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo.core.types import Bev
+from mtpcr_geo.method import paper
+
+Image = NDArray[np.float32]
+Grey = NDArray[np.uint8]
+Look = Literal["band_pass", "paper", "paper_normalised", "grey", "grey_printed"]
+LOOKS: tuple[Look, ...] = get_args(Look)
+
+EMPTY_GREY = 127
+GREY_PER_METRE = 20.0
+
+FINE_SIGMA_CELLS = 0.7
+WIDE_SIGMA_M = 12.0
+HEIGHT_CLIP_M = 8.0
+STEP_FLOOR_M = 1.0
+STEP_RANGE_M = 5.0
+_TINY_WEIGHT = 1e-3
+
+
+def masked_blur(image: Image, mask: Image, sigma_cells: float) -> Image:
+    """Gaussian mean over the filled cells only (normalised convolution).
+
+    Args:
+        image: (h, w) values, 0 where empty.
+        mask: (h, w) 1 where filled, 0 where empty.
+        sigma_cells: standard deviation in cells.
+
+    """
+    weight = cv2.GaussianBlur(mask, (0, 0), sigma_cells, borderType=cv2.BORDER_CONSTANT)
+    total = cv2.GaussianBlur(image * mask, (0, 0), sigma_cells, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(total / np.maximum(weight, _TINY_WEIGHT), np.float32)
+
+
+def filled_height(bev: Bev) -> tuple[Image, Image]:
+    """Give the highest z relative to its median, 0 where empty, and the mask of filled cells."""
+    filled = bev.count > 0
+    middle = np.median(bev.top[filled]) if filled.any() else 0.0
+    height = np.where(filled, bev.top - np.float32(middle), np.float32(0))
+    return np.asarray(height, np.float32), filled.astype(np.float32)
+
+
+def band_pass(height: Image, mask: Image, cell: float) -> Image:
+    """Height above its surroundings: smoothed by 0.7 cell, less the mean over 12 m, clipped to 8 m.
+
+    Args:
+        height: (h, w) metres, 0 where empty.
+        mask: (h, w) 1 where filled.
+        cell: edge of a cell, metres.
+
+    Returns:
+        (h, w) metres, 0 where empty.
+
+    """
+    wide = masked_blur(height, mask, max(WIDE_SIGMA_M / cell, 1.5))
+    fine = masked_blur(height, mask, FINE_SIGMA_CELLS)
+    return np.asarray(np.clip(fine - wide, -HEIGHT_CLIP_M, HEIGHT_CLIP_M) * mask, np.float32)
+
+
+def step_edges(height: Image, mask: Image, cell: float) -> Image:
+    """Height steps: the range within 3 x 3 filled cells, 1..6 m mapped to 0..1, locally centred.
+
+    Args:
+        height: (h, w) metres, 0 where empty.
+        mask: (h, w) 1 where filled.
+        cell: edge of a cell, metres.
+
+    Returns:
+        (h, w) unitless, 0 where empty, with zero mean over 12 m.
+
+    """
+    far = np.float32(1e6)
+    window = np.ones((3, 3), np.uint8)
+    high = cv2.dilate(np.where(mask > 0, height, -far), window)
+    low = cv2.erode(np.where(mask > 0, height, far), window)
+    step = np.clip((high - low - STEP_FLOOR_M) / STEP_RANGE_M, 0.0, 1.0).astype(np.float32) * mask
+    centred = step - masked_blur(step, mask, max(WIDE_SIGMA_M / cell, 1.5))
+    return np.asarray(centred * mask, np.float32)
+
+
+@dataclass(frozen=True)
+class Channels:
+    """The two channels on which correlation works, and where they are known.
+
+    Attributes:
+        height: (h, w) float32 band-passed height, metres, 0 where empty.
+        steps: (h, w) float32 centred step edges, 0 where empty.
+        mask: (h, w) float32, 1 where filled.
+
+    """
+
+    height: Image
+    steps: Image
+    mask: Image
+
+    @cached_property
+    def stack(self) -> Image:
+        """All three as one (3, h, w) array: height, steps, mask."""
+        return np.stack([self.height, self.steps, self.mask])
+
+
+def channels(bev: Bev) -> Channels:
+    """Make the correlation channels of a height raster."""
+    height, mask = filled_height(bev)
+    return Channels(band_pass(height, mask, bev.grid.cell), step_edges(height, mask, bev.grid.cell), mask)
+
+
+def band_image(bev: Bev) -> Grey:
+    """Make the grey image of the band-passed height: 127 + 20 per metre, 127 where empty: (h, w) uint8.
+
+    It shows a roof of three metres alike on a hill and in a valley, and has no edge where the data end.
+    """
+    height, mask = filled_height(bev)
+    grey = EMPTY_GREY + GREY_PER_METRE * band_pass(height, mask, bev.grid.cell)
+    return np.asarray(np.clip(np.rint(grey), 0, 255), np.uint8)
+
+
+def image_of(bev: Bev, look: Look) -> Grey:
+    """Make the image that keypoint matchers see: (h, w) uint8.
+
+    Args:
+        bev: the raster.
+        look: "band_pass" (ours); "paper" (Eq. 3 corrected, Eq. 4 saturating); "paper_normalised" (Eq. 4
+            divided by the filters' sums); "grey" (Eq. 3 corrected alone); "grey_printed" (Eq. 3 as printed,
+            which is black but for the highest cell).
+
+    """
+    if look == "band_pass":
+        return band_image(bev)
+    plain = paper.grey(bev, printed=look == "grey_printed")
+    if look in ("grey", "grey_printed"):
+        return plain
+    return paper.enhance(plain, "saturated" if look == "paper" else "normalised")
+
+
+def empty_grey(look: Look) -> int:
+    """Give the grey value of empty cells in an image of that look."""
+    return EMPTY_GREY if look == "band_pass" else 0

@@ -1,0 +1,255 @@
+"""From ties to a rigid transform: iterative SVD with outlier rejection, and a robust start for it.
+
+One SVD over many outliers does not recover, however often it is repeated; with gravity known only a yaw and
+a shift remain, two ties determine them, and RANSAC over pairs of ties gives a start that does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.errors import RegistrationError
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def fit_rigid(source: Floats, target: Floats, weight: Floats | None = None) -> Floats:
+    """Least-squares rigid transform without scale (Kabsch; Umeyama 1991, doi:10.1109/34.88573).
+
+    Args:
+        source, target: (n, 3) corresponding points, metres, n >= 3 and not on a line.
+        weight: (n,) non-negative weights; equal if None.
+
+    Returns:
+        4x4 transform from source to target; the rotation is proper (determinant +1).
+
+    """
+    w = np.ones(len(source)) if weight is None else np.asarray(weight, np.float64)
+    w = w / w.sum()
+    cs, ct = w @ source, w @ target
+    U, _, Vt = np.linalg.svd((target - ct).T @ ((source - cs) * w[:, None]))
+    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return transforms.compose(R, ct - R @ cs)
+
+
+def fit_upright(source: Floats, target: Floats, weight: Floats | None = None) -> Floats:
+    """Least-squares yaw and shift, with the vertical known.
+
+    Args:
+        source, target: (n, 3) or (n, 2) corresponding points, metres, n >= 2.
+        weight: (n,) non-negative weights; equal if None.
+
+    Returns:
+        4x4 transform; its vertical shift is the mean height difference, 0 for planar input.
+
+    """
+    w = np.ones(len(source)) if weight is None else np.asarray(weight, np.float64)
+    w = w / w.sum()
+    cs, ct = w @ source, w @ target
+    a, b = source - cs, target - ct
+    cross = float(w @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
+    dot = float(w @ (a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]))
+    R = transforms.yaw_matrix(np.arctan2(cross, dot))
+    if source.shape[1] == 2:
+        cs, ct = np.append(cs, 0.0), np.append(ct, 0.0)
+    return transforms.compose(R, ct - R @ cs)
+
+
+def ransac_upright(
+    source: Floats, target: Floats, tolerance: float, seed: int, iterations: int = 2000
+) -> tuple[Floats, Mask]:
+    """Find the yaw and shift on which most ties agree in plan.
+
+    Args:
+        source, target: (n, >=2) corresponding points, metres.
+        tolerance: largest plan residual of an inlier, metres.
+        seed: of the sampling.
+        iterations: pairs of ties tried.
+
+    Returns:
+        4x4 transform refitted to its inliers (planar: no vertical part), and the (n,) inlier mask.
+        With fewer than two ties, the identity and an empty mask.
+
+    """
+    n = len(source)
+    s, t = np.asarray(source[:, :2]), np.asarray(target[:, :2])
+    if n < 2:
+        return np.eye(4), np.zeros(n, bool)
+    rng = np.random.default_rng(seed)
+    first = rng.integers(0, n, iterations)
+    second = (first + rng.integers(1, n, iterations)) % n
+    ds, dt = s[second] - s[first], t[second] - t[first]
+    ls, lt = np.hypot(*ds.T), np.hypot(*dt.T)
+    # a rigid motion keeps distances; short bases turn noise into yaw
+    usable = (np.abs(ls - lt) < 2 * tolerance) & (ls > 4 * tolerance)
+    first, ds, dt = first[usable], ds[usable], dt[usable]
+    if not len(first):
+        return np.eye(4), np.zeros(n, bool)
+    yaw = np.arctan2(ds[:, 0] * dt[:, 1] - ds[:, 1] * dt[:, 0], (ds * dt).sum(axis=1))
+    best = _most_agreed(s, t, yaw, first, tolerance)
+    T = fit_upright(s[best], t[best])
+    for _ in range(5):
+        residual = np.hypot(*(transforms.apply(T, _planar(s))[:, :2] - t).T)
+        inlier = residual < tolerance
+        if inlier.sum() < 2 or (inlier == best).all():
+            break
+        best = inlier
+        T = fit_upright(s[best], t[best])
+    return T, best
+
+
+def _most_agreed(s: Floats, t: Floats, yaw: Floats, anchor: NDArray[np.int64], tolerance: float) -> Mask:
+    """Mark the ties that agree with the best of many poses, each a yaw about a tie that it maps exactly."""
+    best, best_count = np.zeros(len(s), bool), -1
+    # a few million numbers at a time
+    step = max(1, 2_000_000 // len(s))
+    for start in range(0, len(yaw), step):
+        c, r = np.cos(yaw[start : start + step, None]), np.sin(yaw[start : start + step, None])
+        i = anchor[start : start + step]
+        east = c * s[:, 0] - r * s[:, 1] - t[:, 0]
+        north = r * s[:, 0] + c * s[:, 1] - t[:, 1]
+        rows = np.arange(len(i))
+        east -= east[rows, i][:, None]
+        north -= north[rows, i][:, None]
+        agree = east * east + north * north < tolerance**2
+        counts = agree.sum(axis=1)
+        k = int(np.argmax(counts))
+        if counts[k] > best_count:
+            best, best_count = agree[k], int(counts[k])
+    return best
+
+
+def _planar(xy: Floats) -> Floats:
+    return np.column_stack([xy, np.zeros(len(xy))])
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Result of the iterative SVD.
+
+    Attributes:
+        T: 4x4 from source to target.
+        inlier: (n,) ties within the final threshold.
+        iterations: rounds until nothing changed.
+        threshold: final residual threshold, metres.
+
+    """
+
+    T: Floats
+    inlier: Mask
+    iterations: int
+    threshold: float
+
+
+def iterative_svd(
+    source: Floats,
+    target: Floats,
+    *,
+    start: Mask | None = None,
+    weight: Floats | None = None,
+    factor: float = 2.5,
+    floor: float = 0.5,
+    ceiling: float = np.inf,
+    max_iterations: int = 30,
+    upright: bool = False,
+) -> Solution:
+    """Fit, drop what lies beyond ``factor`` robust standard deviations, and repeat until stable.
+
+    Args:
+        source, target: (n, 3) ties, metres.
+        start: (n,) ties of the first fit; all if None (as in the paper).
+        weight: (n,) weights.
+        factor: residuals beyond this many times 1.4826 median residuals are outliers.
+        floor: the threshold never falls below this, metres: below the raster's own precision a residual
+            says nothing.
+        ceiling: nor does it rise above this, metres: from few ties that agree badly it would grow until it
+            takes in all.
+        max_iterations: rounds at most.
+        upright: solve yaw and shift only.
+
+    """
+    fit = fit_upright if upright else fit_rigid
+    least = 2 if upright else 3
+    inlier = np.ones(len(source), bool) if start is None else start.copy()
+    T, threshold, rounds = np.eye(4), floor, 0
+    for rounds in range(1, max_iterations + 1):  # noqa: B007 - reported below
+        T = fit(source[inlier], target[inlier], None if weight is None else weight[inlier])
+        residual = np.linalg.norm(transforms.apply(T, source) - target, axis=1)
+        spread = 1.4826 * float(np.median(residual[inlier]))
+        threshold = min(max(floor, factor * spread), ceiling)
+        now = residual < threshold
+        if now.sum() < least or (now == inlier).all():
+            break
+        inlier = now
+    return Solution(T, inlier, rounds, threshold)
+
+
+def solve_ties(
+    source: Floats,
+    target: Floats,
+    score: Floats,
+    withheld: Mask,
+    *,
+    tolerance: float,
+    robust_start: bool = True,
+    upright: bool = True,
+    tries: int = 2000,
+    seed: int = 0,
+) -> tuple[Solution, Mask]:
+    """Solve the transform from the ties not withheld: robust start, then iterative SVD.
+
+    Args:
+        source, target: (n, 3) levelled ties, metres.
+        score: (n,) weights of the ties, squared in the fit.
+        withheld: (n,) ties to leave out.
+        tolerance: plan residual up to which a tie may agree with a pose, metres; about 1.5 cells.
+        robust_start: begin from the yaw and shift that RANSAC finds; else from all ties, as in the paper.
+        upright: solve yaw and shift, trusting the levelling; else all six degrees of freedom.
+        tries: pairs of ties that RANSAC tries.
+        seed: of RANSAC.
+
+    Returns:
+        The solution, whose inlier mask covers the used ties only, and the (n,) mask of all ties within
+        the final threshold in plan, withheld ones included.
+
+    Raises:
+        RegistrationError: if fewer ties agree than a transform needs.
+
+    """
+    used = np.flatnonzero(~withheld)
+    least = 3
+    if len(used) < least:
+        raise RegistrationError(
+            f"only {len(used)} ties to solve a transform from, at least {least} are needed; "
+            "the clouds share too little, or another --cell or matcher may find more"
+        )
+    s, t = source[used], target[used]
+    start = None
+    if robust_start:
+        _, start = ransac_upright(s, t, tolerance, seed, tries)
+        if start.sum() < least:
+            raise RegistrationError(
+                f"of {len(used)} ties no {least} agree on one yaw and shift; the clouds may not overlap"
+            )
+    # the start says to what distance ties agree; as in the paper there is no such bound
+    ceiling = 2.0 * tolerance if robust_start else np.inf
+    weight = np.maximum(score[used], 0.05) ** 2
+    flat = np.array([1.0, 1.0, 0.0])
+    if upright:
+        # heights of single ties are rough, so they have no say in plan and are settled by their median
+        solution = iterative_svd(
+            s * flat, t * flat, start=start, weight=weight, floor=tolerance, ceiling=ceiling, upright=True
+        )
+        moved = transforms.apply(solution.T, s)
+        rise = float(np.median((t - moved)[solution.inlier, 2]))
+        T = transforms.translation((0.0, 0.0, rise)) @ solution.T
+        solution = replace(solution, T=T)
+    else:
+        solution = iterative_svd(s, t, start=start, weight=weight, floor=tolerance, ceiling=ceiling)
+    plan = np.hypot(*(transforms.apply(solution.T, source) - target)[:, :2].T)
+    return solution, plan < max(tolerance, solution.threshold)

@@ -1,0 +1,1 @@
+"""PDAL's own stages in pipelines, where PDAL is installed."""

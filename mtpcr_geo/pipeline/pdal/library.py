@@ -1,0 +1,128 @@
+"""The `pdal` package where it is installed: what this PDAL has, and whether it would take given stages.
+
+Nothing about PDAL is assumed: stages and options are asked of the library that is there (2.2 to 2.10).
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtpcr_geo.core.errors import MissingPartError
+
+INSTALL = (
+    "install PDAL and its Python package: conda install -c conda-forge python-pdal (all systems), "
+    "apk add py3-pdal (Alpine), port install py-pdal (MacPorts), or use the container pdal/pdal; "
+    "Debian and Ubuntu have no package"
+)
+# what no cloud has: a stage behind all others that always stops PDAL between preparing and running
+_STOP_DIMENSION = "MtpcrStopHere"
+_STOP = {"type": "filters.range", "limits": f"{_STOP_DIMENSION}[0:1]", "tag": "mtpcr_stop_here"}
+_ERRORS = (RuntimeError, ValueError, TypeError)
+_SETTLE_S = 0.01
+
+
+@dataclass(frozen=True)
+class Driver:
+    """A stage that PDAL has.
+
+    Attributes:
+        name: such as "filters.outlier".
+        description: PDAL's one line about it.
+        options: PDAL's description of each option, by name.
+        streamable: whether it works point by point.
+
+    """
+
+    name: str
+    description: str
+    options: Mapping[str, str]
+    streamable: bool
+
+
+def available() -> bool:
+    """Whether the `pdal` package can be imported."""
+    return importlib.util.find_spec("pdal") is not None
+
+
+@cache
+def drivers() -> dict[str, Driver]:
+    """Ask PDAL which stages it has, with their options.
+
+    Raises:
+        MissingPartError: if the package is there but does not load.
+
+    """
+    load()
+    # the package does not keep its extension module as an attribute
+    library = importlib.import_module("pdal.libpdalpython")
+    options = library.getOptions()
+    return {
+        driver["name"]: Driver(
+            driver["name"],
+            driver.get("description", ""),
+            {option["name"]: option.get("description", "") for option in options.get(driver["name"]) or ()},
+            bool(driver.get("streamable")),
+        )
+        for driver in library.getDrivers()
+    }
+
+
+def load() -> Any:
+    """Import the `pdal` package.
+
+    Raises:
+        MissingPartError: saying how to install it.
+
+    """
+    try:
+        import pdal
+    except ImportError as error:
+        raise MissingPartError(f"the package pdal does not load ({error}); {INSTALL}") from error
+    return pdal
+
+
+def pipeline(stages: Sequence[Mapping[str, Any]]) -> Any:
+    """Make a `pdal.Pipeline` of stages, without running it."""
+    return load().Pipeline(json.dumps(list(stages)))
+
+
+def arrays_of(iterator: Any) -> Iterator[NDArray[np.void]]:
+    """Yield the arrays of python-pdal's streaming iterator, without being caught in its end.
+
+    Its worker thread marks the end (``PythonPointTable::done``, up to 3.5.5 at least) without the lock that
+    its consumer looks under: who looks just then misses the mark and waits for ever, some once in a
+    thousand streams. After its last array the worker needs a fraction of a millisecond; so each array is
+    followed by a pause long enough for the mark to be there, and short beside reading a full array.
+    """
+    for records in iterator:
+        yield records
+        time.sleep(_SETTLE_S)
+
+
+def problem_of(stages: Sequence[Mapping[str, Any]]) -> str | None:
+    """Let PDAL prepare stages without running them, and give what it says against them, if anything.
+
+    Preparing reads the options and the headers of inputs; no point is read and no file is written.
+    """
+    try:
+        pipeline([*stages, _STOP]).execute()
+    except _ERRORS as error:
+        message = first_line(error)
+        return None if _STOP_DIMENSION in message else message
+    return None
+
+
+def first_line(error: BaseException) -> str:
+    """Give the first line of PDAL's message, without a full stop."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[0].rstrip(". ")

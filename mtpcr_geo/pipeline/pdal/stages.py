@@ -1,0 +1,149 @@
+"""PDAL's stages in our pipelines: composed while contiguous, handed to real PDAL together."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ConfigDict
+
+from mtpcr_geo.core.cloud import Cloud
+from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError, OutputError
+from mtpcr_geo.core.suggestions import meant
+from mtpcr_geo.pipeline.grammar import StageSpec, file_of
+from mtpcr_geo.pipeline.pdal import library
+from mtpcr_geo.pipeline.pdal.cloud import PdalCloud, Step
+from mtpcr_geo.pipeline.stage import RunContext, Stage, StageOptions, Value
+
+# the name under which a file is written until the run is whole
+_PASSING = re.compile(r"\.([^/\\]+)\.part-\d+(\.\w+)")
+_NO_POINTS = {"type": "readers.faux", "count": 1, "mode": "constant", "bounds": "([0, 1], [0, 1], [0, 1])"}
+
+
+class PdalOptions(StageOptions):
+    """Options of a PDAL stage: PDAL itself checks them."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+
+class PdalStage(Stage):
+    """A stage that PDAL serves.
+
+    Attributes:
+        boundary: whether PDAL must run once this stage is reached: a stage of ours takes from it, or none.
+        for_us: whether a stage of ours takes from it.
+        upstream: the stages it takes from.
+        stand_in: a file whose dimensions the clouds have that our stages hand to PDAL, or None.
+
+    """
+
+    type = "pdal"
+    Options = PdalOptions
+
+    def __init__(self, options: StageOptions, spec: StageSpec) -> None:
+        super().__init__(options, spec.tag)
+        self.spec = spec
+        self.boundary = True
+        self.for_us = False
+        self.upstream: Sequence[Stage] = ()
+        self.stand_in: Path | None = None
+        self.written = False
+
+    def reads(self) -> list[Path]:
+        """Name the file of a reader."""
+        name = file_of(self.spec.options)
+        return [Path(name)] if self.is_reader and name and "://" not in name else []
+
+    def writes(self) -> list[Path]:
+        """Name the file of a writer; one with a # becomes one file a view, known only when written."""
+        name = file_of(self.spec.options)
+        if not self.is_writer or not name:
+            return []
+        return [Path(name)] if "#" not in name else []
+
+    @property
+    def is_reader(self) -> bool:
+        """Whether it starts a chain."""
+        return self.spec.type.startswith("readers.")
+
+    @property
+    def is_writer(self) -> bool:
+        """Whether it leaves a file."""
+        return self.spec.type.startswith("writers.")
+
+    def check(self, context: RunContext) -> None:
+        """Let PDAL prepare everything up to this stage, without running it."""
+        chain: dict[str, dict[str, Any]] = {}
+        guessed = self._prepared(chain)
+        problem = library.problem_of(list(chain.values()))
+        # without the true cloud, PDAL cannot know which dimensions there will be
+        if problem and not (guessed and "dimension" in problem.lower()):
+            raise self.failed(problem, preparing=True)
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Join the chain; at its end, run it all in PDAL."""
+        clouds = [given for given in inputs if isinstance(given, Cloud)]
+        if len(clouds) < len(inputs):
+            raise OptionError(f"{self.label} needs clouds; put mtpcr.apply before it, which moves the source")
+        cloud = PdalCloud(self._step(clouds))
+        if self.boundary:
+            cloud.evaluate(context, need_crs=self.for_us)
+        return cloud
+
+    def failed(self, message: str, *, preparing: bool = False) -> MtpcrError:
+        """Put what PDAL says in one line that names this stage."""
+        detail = _PASSING.sub(r"\1\2", message.removeprefix(f"{self.spec.type}: "))
+        text = f"{self.label}: PDAL says: {detail}"
+        if "argument" in detail or (preparing and not self.is_reader):
+            return OptionError(text)
+        return OutputError(text) if self.is_writer else InputError(text)
+
+    def _step(self, inputs: Sequence[Cloud]) -> Step:
+        before = tuple(given.step if isinstance(given, PdalCloud) else given for given in inputs)
+        return Step(self, before)
+
+    def _prepared(self, chain: dict[str, dict[str, Any]]) -> bool:
+        """Add this stage and all before it to a chain for PDAL; say whether a cloud had to be guessed."""
+        guessed = False
+        inputs = []
+        for stage in self.upstream:
+            if isinstance(stage, PdalStage):
+                if stage.tag not in chain:
+                    guessed |= stage._prepared(chain)
+            elif self.stand_in is not None:
+                chain[stage.tag] = {"type": "readers.las", "filename": str(self.stand_in), "tag": stage.tag}
+            else:
+                guessed = True
+                chain[stage.tag] = {**_NO_POINTS, "tag": stage.tag}
+            inputs.append(stage.tag)
+        chain[self.tag] = pdal_words(self.spec, inputs)
+        return guessed
+
+
+def pdal_words(spec: StageSpec, inputs: Sequence[str], **changed: Any) -> dict[str, Any]:
+    """Put a stage in PDAL's JSON."""
+    words = {**spec.options, **changed, "type": spec.type, "tag": spec.tag}
+    return {**words, "inputs": list(inputs)} if inputs else words
+
+
+def make_pdal_stage(spec: StageSpec) -> PdalStage:
+    """Make a stage that PDAL serves.
+
+    Raises:
+        OptionError: if this PDAL does not know the stage, or an option of it.
+
+    """
+    drivers = library.drivers()
+    if spec.type not in drivers:
+        raise OptionError(f"{spec.label}: this PDAL has no stage {spec.type!r}{meant(spec.type, drivers)}")
+    known = drivers[spec.type].options
+    for name in spec.options:
+        if known and name not in known:
+            raise OptionError(f"{spec.label}: no option {name!r}{meant(name, known)}")
+    words: Mapping[str, Any] = {key: value for key, value in spec.options.items() if key != "user_data"}
+    # every PDAL stage has a class of its own, so that its type is a class attribute as everywhere
+    kind = type("PdalStage", (PdalStage,), {"type": spec.type, "__doc__": drivers[spec.type].description})
+    stage: PdalStage = kind(PdalOptions.model_validate(words), spec)
+    return stage

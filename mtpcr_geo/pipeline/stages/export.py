@@ -1,0 +1,276 @@
+"""Stages that bring the result out: the moved cloud, and writers for evidence and transforms."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.recorder import NullRecorder
+from mtpcr_geo.core.system import peak_memory_mb
+from mtpcr_geo.core.types import Pair, Side, Verdict
+from mtpcr_geo.pipeline.stage import RunContext, Stage, StageOptions, Value
+
+TransformFormat = Literal["json", "cloudcompare", "pdal"]
+
+
+class ApplyOptions(StageOptions):
+    """Options of mtpcr.apply."""
+
+    force: bool = Field(False, description="hand on the moved cloud though the verdict refuses it")
+
+
+class Apply(Stage):
+    """Move the source to the target: hands on the moved cloud, or nothing when the verdict is refused."""
+
+    type = "mtpcr.apply"
+    Options = ApplyOptions
+    options: ApplyOptions
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Give the source's points in the target's CRS and units, streamed on demand."""
+        from mtpcr_geo.io.views import Moved
+
+        pair = self.one_pair(inputs)
+        if pair.T_target_source is None:
+            raise OptionError(f"{self.label} needs a solved pair; put mtpcr.solve before it")
+        if refused(pair) and not (self.options.force or context.force):
+            self.metadata["withheld"] = "the verdict is refused"
+            return None
+        return Moved(pair)
+
+
+class FileOptions(StageOptions):
+    """Options of a writer of one file."""
+
+    filename: Path = Field(description="file to write")
+
+
+class EvidenceWriter(Stage):
+    """Writes what there is of a pair, and hands it on; has nothing to do where there is no pair."""
+
+    evidence = True
+    Options = FileOptions
+    options: FileOptions
+
+    def writes(self) -> list[Path]:
+        """Name the file."""
+        return [self.options.filename]
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Write the file if the pair holds what it needs."""
+        if not inputs and context.failure is not None:
+            self.metadata["skipped"] = "no pair was made"
+            return None
+        pair = self.one_pair(inputs)
+        missing = self.missing(pair, context)
+        if missing:
+            self.metadata["skipped"] = missing
+        else:
+            self.write(pair, context)
+        return pair
+
+    def missing(self, pair: Pair, context: RunContext) -> str | None:
+        """Say what keeps this writer from writing, if anything does."""
+        return None
+
+    def write(self, pair: Pair, context: RunContext) -> None:
+        """Write the file under its passing name."""
+        raise NotImplementedError
+
+
+class WriteBev(EvidenceWriter):
+    """Write the height rasters as GeoTIFF."""
+
+    type: ClassVar[str] = "mtpcr.write_bev"
+
+    class Options(FileOptions):
+        """Options of mtpcr.write_bev."""
+
+        filename: Path = Field(
+            description="file to write; a # in it stands for 'source', 'target' and, once the pair is "
+            "solved, 'registered': the source's raster laid over the target's"
+        )
+
+    def writes(self) -> list[Path]:
+        """Name both files, or the one."""
+        if "#" not in self.options.filename.name:
+            return [self.options.filename]
+        return [self._file(role) for role in ("source", "target", "registered")]
+
+    def missing(self, pair: Pair, context: RunContext) -> str | None:
+        """Need a raster."""
+        return None if any(side.bev is not None for side in self._sides(pair)) else "no raster was made"
+
+    def write(self, pair: Pair, context: RunContext) -> None:
+        """Write a GeoTIFF for each side that has a raster."""
+        from mtpcr_geo.export.geotiff import write_registered_bev, write_side_bev
+
+        sides = [side for side in self._sides(pair) if side.bev is not None]
+        if len(sides) > 1 and "#" not in self.options.filename.name:
+            raise OptionError(
+                f"{self.label}: two rasters are two files; write a # in the filename for the roles"
+            )
+        for side in sides:
+            write_side_bev(context.outputs.path(self._file(side.role)), side, pair.frame)
+        if len(sides) > 1 and pair.T_target_source is not None and not refused(pair):
+            write_registered_bev(context.outputs.path(self._file("registered")), pair)
+
+    def _file(self, role: str) -> Path:
+        return self.options.filename.with_name(self.options.filename.name.replace("#", role))
+
+    @staticmethod
+    def _sides(pair: Pair) -> list[Side]:
+        return [pair.target] if pair.source is pair.target else [pair.source, pair.target]
+
+
+class WriteTies(EvidenceWriter):
+    """Write ties, their links, footprints and hypotheses as a GeoPackage."""
+
+    type = "mtpcr.write_ties"
+
+    def missing(self, pair: Pair, context: RunContext) -> str | None:
+        """Need ties."""
+        return None if pair.ties is not None else "no ties were found"
+
+    def write(self, pair: Pair, context: RunContext) -> None:
+        """Write the GeoPackage."""
+        from mtpcr_geo.export.tie_points import write_ties
+
+        write_ties(context.outputs.path(self.options.filename), pair)
+
+
+class WriteTransform(EvidenceWriter):
+    """Write the transform; withheld when the verdict is refused."""
+
+    type: ClassVar[str] = "mtpcr.write_transform"
+
+    class Options(FileOptions):
+        """Options of mtpcr.write_transform."""
+
+        format: TransformFormat | None = Field(
+            None,
+            description="json for mtpcr-geo apply, a cloudcompare matrix, or a pdal pipeline; "
+            "where not given, .pdal.json means pdal, .txt means cloudcompare, all else json",
+        )
+        force: bool = Field(False, description="write it though the verdict refuses it")
+
+    def missing(self, pair: Pair, context: RunContext) -> str | None:
+        """Need a transform that was not refused."""
+        if pair.T_target_source is None:
+            return "no transform was found"
+        if refused(pair) and not (context.force or getattr(self.options, "force", False)):
+            return "the verdict is refused"
+        return None
+
+    def write(self, pair: Pair, context: RunContext) -> None:
+        """Write the file in its format."""
+        from mtpcr_geo.export.transform import (
+            write_cloudcompare_matrix,
+            write_pdal_pipeline,
+            write_transform_json,
+        )
+
+        write = {
+            "json": write_transform_json,
+            "cloudcompare": write_cloudcompare_matrix,
+            "pdal": write_pdal_pipeline,
+        }[self.format]
+        write(context.outputs.path(self.options.filename), pair)
+
+    @property
+    def format(self) -> TransformFormat:
+        """The format, by option or by the file's name."""
+        given: TransformFormat | None = getattr(self.options, "format", None)
+        name = self.options.filename.name.lower()
+        by_name: TransformFormat = (
+            "pdal" if name.endswith(".pdal.json") else "cloudcompare" if name.endswith(".txt") else "json"
+        )
+        return given or by_name
+
+
+class WriteRecording(EvidenceWriter):
+    """Record the whole run for the rerun viewer, whatever this stage's place."""
+
+    type = "mtpcr.write_recording"
+
+    def writes(self) -> list[Path]:
+        """Name the recording."""
+        return [self.options.filename]
+
+    def open(self, context: RunContext) -> None:
+        """Put a recorder in place before the first stage runs."""
+        if not context.facts.get("recording", True):
+            return
+        if not isinstance(context.recorder, NullRecorder):
+            raise OptionError(f"{self.label}: a run keeps one recording; remove the second")
+        from mtpcr_geo.export.recording.recorder import RerunRecorder
+
+        context.recorder = RerunRecorder(context.outputs.path(self.options.filename))
+
+    def write(self, pair: Pair, context: RunContext) -> None:
+        """Nothing to do here: the recorder hears of every stage."""
+
+
+class WriteReport(EvidenceWriter):
+    """Write the report about the whole run, as HTML that needs no other file."""
+
+    type = "mtpcr.write_report"
+    late = True
+
+    def write(self, pair: Pair, context: RunContext) -> None:
+        """Write the HTML."""
+        from mtpcr_geo.export.report.page import write_report
+
+        write_report(context.outputs.path(self.options.filename), pair, context.done, context.facts)
+
+
+class WriteRun(EvidenceWriter):
+    """Write what happened as JSON: verdict, times, options, versions, hashes, outputs."""
+
+    type = "mtpcr.write_run"
+    late = True
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Write the file, pair or not."""
+        from mtpcr_geo.export.run_json import write_run_json
+
+        pair = next((given for given in inputs if isinstance(given, Pair)), None)
+        path = context.outputs.path(self.options.filename)
+        write_run_json(path, run_facts(pair, context))
+        return pair
+
+
+def refused(pair: Pair) -> bool:
+    """Whether the verdict is refused."""
+    return pair.verdict is not None and pair.verdict.name == "refused"
+
+
+def run_facts(pair: Pair | None, context: RunContext) -> dict[str, Any]:
+    """Gather what is known about a run near its end."""
+    verdict = pair.verdict if pair else None
+    if verdict is None and context.failure is not None:
+        verdict = Verdict("refused", (context.failure,), {})
+    from mtpcr_geo.export.transform import frames_of
+
+    seconds = {entry["tag"]: round(entry["seconds"], 4) for entry in context.done}
+    return {
+        "verdict": verdict.name if verdict else None,
+        "reasons": list(verdict.reasons) if verdict else [],
+        "metrics": verdict.metrics if verdict else {},
+        # found, which says nothing of whether to use it: that is the verdict
+        "T_target_source": pair.T_file if pair is not None and pair.T_target_source is not None else None,
+        "frames": frames_of(pair) if pair is not None else None,
+        "time_s": {**seconds, "total": round(time.perf_counter() - context.facts["started"], 4)},
+        "peak_memory_mb": peak_memory_mb(),
+        "options": {entry["tag"]: entry["options"] for entry in context.done},
+        "stages": context.done,
+        "pipeline": context.facts["pipeline"],
+        "versions": context.facts.get("versions", {}),
+        "inputs": context.facts.get("inputs", []),
+        "outputs": [str(path) for path in context.outputs.written()],
+    }

@@ -1,0 +1,259 @@
+"""Readers and writers served without PDAL, under PDAL's names and options."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from mtpcr_geo.core.cloud import Cloud
+from mtpcr_geo.core.errors import CrsError, OptionError
+from mtpcr_geo.io.views import Box, Cropped, Head, Moved, parse_bounds
+from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+
+def _path_of(value: Any) -> Any:
+    # PDAL from 2.9 on also takes {"path": ...}
+    return value.get("path", value) if isinstance(value, Mapping) else value
+
+
+def _listed(value: Any) -> Any:
+    return [value] if isinstance(value, str) else value
+
+
+def _checked_bounds(values: list[str]) -> list[str]:
+    for value in values:
+        parse_bounds(value)
+    return values
+
+
+FileName = Annotated[Path, BeforeValidator(_path_of)]
+Bounds = Annotated[list[str], BeforeValidator(_listed), Field(min_length=1)]
+
+
+class LasReaderOptions(StageOptions):
+    """Options of readers.las."""
+
+    filename: FileName = Field(description="file to read: LAS 1.0-1.4, LAZ or COPC")
+    count: int | None = Field(None, ge=1, description="read at most this many points, from the first on")
+    override_srs: str | None = Field(None, description="CRS to take instead of what the file states")
+    default_srs: str | None = Field(None, description="CRS to take where the file states none")
+
+
+class LasReader(Stage):
+    """Read LAS, LAZ or COPC; points are streamed when a later stage asks for them."""
+
+    type: ClassVar[str] = "readers.las"
+    Options: ClassVar[OptionsModel] = LasReaderOptions
+    options: LasReaderOptions
+
+    def reads(self) -> list[Path]:
+        """Name the file."""
+        return [self.options.filename]
+
+    def check(self, context: RunContext) -> None:
+        """Open the header, and read the CRS options."""
+        self._open()
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Give the cloud, known by its header."""
+        cloud = self._open()
+        self.metadata |= {
+            "filename": str(self.options.filename),
+            "count": cloud.count,
+            "minimum": cloud.minimum.tolist(),
+            "maximum": cloud.maximum.tolist(),
+            "srs": cloud.crs.to_wkt() if cloud.crs is not None else "",
+        }
+        return cloud
+
+    def _open(self) -> Cloud:
+        from mtpcr_geo.io.las import open_cloud
+
+        override = stated_crs(self, "override_srs", self.options.override_srs)
+        default = stated_crs(self, "default_srs", self.options.default_srs)
+        cloud: Cloud = open_cloud(self.options.filename, override)
+        if cloud.crs is None and default is not None:
+            cloud = open_cloud(self.options.filename, default)
+        if self.options.count is not None and self.options.count < cloud.count:
+            cloud = Head(cloud, self.options.count)
+        return cloud
+
+
+class CopcReaderOptions(LasReaderOptions):
+    """Options of readers.copc."""
+
+    bounds: Bounds | None = Field(
+        None, description='keep what lies in "([xmin, xmax], [ymin, ymax])", in the file\'s units'
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> CopcReaderOptions:
+        _checked_bounds(self.bounds or [])
+        return self
+
+
+class CopcReader(LasReader):
+    """Read COPC, whole or within bounds."""
+
+    type: ClassVar[str] = "readers.copc"
+    Options = CopcReaderOptions
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Give the cloud, cropped where bounds are given."""
+        cloud = super().run(inputs, context)
+        bounds = self.options.bounds if isinstance(self.options, CopcReaderOptions) else None
+        if bounds is None or not isinstance(cloud, Cloud):
+            return cloud
+        return Cropped(cloud, [parse_bounds(text) for text in bounds])
+
+
+class CropOptions(StageOptions):
+    """Options of filters.crop, as far as it is served without PDAL."""
+
+    bounds: Bounds = Field(description='keep what lies in "([xmin, xmax], [ymin, ymax])"; several join')
+    outside: bool = Field(False, description="keep what lies outside instead")
+
+    @model_validator(mode="after")
+    def _check(self) -> CropOptions:
+        _checked_bounds(self.bounds)
+        return self
+
+    @property
+    def boxes(self) -> list[Box]:
+        """The bounds, read."""
+        return [parse_bounds(text) for text in self.bounds]
+
+
+class Crop(Stage):
+    """Keep the points within bounds."""
+
+    type = "filters.crop"
+    Options = CropOptions
+    options: CropOptions
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Give the cloud cropped; points stream through."""
+        return Cropped(one_cloud(self, inputs), self.options.boxes, self.options.outside)
+
+
+class LasWriterOptions(StageOptions):
+    """Options of writers.las, as far as it is served without PDAL."""
+
+    filename: FileName = Field(description="file to write: LAS 1.4; .laz is compressed")
+    a_srs: str | None = Field(None, description="CRS to state instead of the cloud's own")
+    compression: Literal["laszip", "lazperf", "true", "none", "false"] | None = Field(
+        None, description="whether to write LAZ; the file's name says it if this does not"
+    )
+    scale_x: float | None = Field(None, gt=0, description="size of the last digit of x, in units of the CRS")
+    scale_y: float | None = Field(None, gt=0, description="size of the last digit of y, in units of the CRS")
+    scale_z: float | None = Field(None, gt=0, description="size of the last digit of z, in units of the CRS")
+    minor_version: Literal[4] = Field(4, description="only LAS 1.4 is written")
+    extra_dims: Literal["all"] = Field("all", description="every extra dimension is kept")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _plain(cls, words: Any) -> Any:
+        compression = words.get("compression") if isinstance(words, dict) else None
+        if isinstance(compression, bool):
+            return {**words, "compression": str(compression).lower()}
+        return words
+
+    @model_validator(mode="after")
+    def _check(self) -> LasWriterOptions:
+        if self.compression is not None:
+            wanted = self.compression not in ("none", "false")
+            if wanted != (self.filename.suffix.lower() == ".laz"):
+                raise ValueError(
+                    f"compression {self.compression} does not suit the name {self.filename.name}; "
+                    "LAZ ends in .laz, LAS in .las"
+                )
+        scales = (self.scale_x, self.scale_y, self.scale_z)
+        if any(scales) and not all(scales):
+            raise ValueError("scale_x, scale_y and scale_z go together; give all three or none")
+        return self
+
+    @property
+    def scale(self) -> tuple[float, float, float] | None:
+        """The scales, where given."""
+        if self.scale_x is None or self.scale_y is None or self.scale_z is None:
+            return None
+        return self.scale_x, self.scale_y, self.scale_z
+
+
+class LasWriter(Stage):
+    """Write LAS 1.4 or LAZ: point format 6 or up, WKT, every dimension and extra byte kept."""
+
+    type: ClassVar[str] = "writers.las"
+    Options = LasWriterOptions
+    options: LasWriterOptions
+
+    def writes(self) -> list[Path]:
+        """Name the file."""
+        return [self.options.filename]
+
+    def check(self, context: RunContext) -> None:
+        """Read the CRS option."""
+        stated_crs(self, "a_srs", self.options.a_srs)
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Stream the cloud to the file, and hand it on."""
+        from mtpcr_geo.io.write import write_cloud
+
+        cloud = one_cloud(self, inputs)
+        crs = stated_crs(self, "a_srs", self.options.a_srs) or cloud.crs
+        scale = self.options.scale
+        path = context.outputs.path(self.options.filename)
+        base, move = (cloud.base, cloud.move) if isinstance(cloud, Moved) else (cloud, None)
+        with context.progress.task(f"writing {self.options.filename.name}", cloud.count) as advance:
+            write_cloud(path, base, move, crs, scale, advance=advance)
+        self.metadata |= {"filename": str(self.options.filename), "count": cloud.count}
+        return cloud
+
+
+class CopcWriter(LasWriter):
+    """Write COPC."""
+
+    type: ClassVar[str] = "writers.copc"
+
+
+def one_cloud(stage: Stage, inputs: Sequence[Value]) -> Cloud:
+    """Take the single cloud among a stage's inputs.
+
+    Raises:
+        OptionError: if the inputs are something else.
+
+    """
+    if len(inputs) == 1 and isinstance(inputs[0], Cloud):
+        return inputs[0]
+    if len(inputs) == 1:
+        raise OptionError(
+            f"{stage.label} needs a cloud and got a pair of clouds; "
+            "put mtpcr.apply before it, which moves the source"
+        )
+    raise OptionError(
+        f"{stage.label} needs one cloud and got {len(inputs)} inputs; name one in its inputs, "
+        "or join them by PDAL's filters.merge"
+    )
+
+
+def stated_crs(stage: Stage, option: str, text: str | None) -> CRS | None:
+    """Read a CRS option of a stage; None where it is not given.
+
+    Raises:
+        CrsError: naming the stage and the option.
+
+    """
+    from mtpcr_geo.crs import parse_crs
+
+    if text is None:
+        return None
+    try:
+        return parse_crs(text)
+    except CrsError as error:
+        raise CrsError(f"{stage.label}: option {option!r}: {error}") from error

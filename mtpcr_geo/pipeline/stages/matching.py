@@ -1,0 +1,304 @@
+"""The stages that find matches: the image, the matcher, FOCUS."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.types import Appearance, Bev, Pair, Side
+from mtpcr_geo.method.images import Look
+from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
+from mtpcr_geo.pipeline.stages.solving import bevs_of, georeference
+
+if TYPE_CHECKING:
+    from mtpcr_geo.match.base import Matcher, View
+    from mtpcr_geo.match.correlation import Prior
+
+_OF_CORRELATION = {"yaw_step", "patch", "reach", "min_overlap", "prior_sigma"}
+_OF_KEYPOINTS = {
+    "models", "turns", "tolerance", "max_keypoints", "tile", "ratio", "cross_check", "device", "threads",
+}  # fmt: skip
+BORNE_TURN_DEG = 22.5
+"""Turn that every keypoint matcher bears, so that a yaw known as well as that needs no sweep."""
+
+
+class EnhanceOptions(StageOptions):
+    """Options of mtpcr.enhance."""
+
+    look: Look = Field(
+        "band_pass",
+        description="image that keypoint matchers see: height above the surroundings; the paper's grey "
+        "values sharpened by its two filters (paper), or by the same without their gain (paper_normalised); "
+        "the paper's grey values alone (grey), or as its Eq. 3 is printed (grey_printed)",
+    )
+
+
+class Enhance(Stage):
+    """Make the images that keypoint matchers see (Eq. 3 and 4, or band-passed heights)."""
+
+    type: ClassVar[str] = "mtpcr.enhance"
+    Options: ClassVar[OptionsModel] = EnhanceOptions
+    options: EnhanceOptions
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Make both images."""
+        pair = self.one_pair(inputs)
+        sides = [pair.target] if pair.source is pair.target else [pair.target, pair.source]
+        done = [replace(side, appearance=self._look_at(side)) for side in sides]
+        for side in done:
+            assert side.appearance is not None
+            image = side.appearance.image
+            self.metadata[side.role] = {
+                "mean_grey": float(image.mean()),
+                "saturated_share": float(((image == 0) | (image == 255)).mean()),
+            }
+        return pair.with_(target=done[0], source=done[-1])
+
+    def _look_at(self, side: Side) -> Appearance:
+        from mtpcr_geo.method.images import image_of
+        from mtpcr_geo.method.paper import grey
+
+        if side.bev is None:
+            raise OptionError(f"{self.label} needs height rasters; put mtpcr.bev before it")
+        return Appearance(self.options.look, grey(side.bev), image_of(side.bev, self.options.look))
+
+
+class MatchOptions(StageOptions):
+    """Options of mtpcr.match."""
+
+    method: str = Field(
+        "correlation",
+        description="which matcher: correlation (needs no keypoints), rootsift, orb, or a learned one by the "
+        "name of its description: xfeat, aliked, superpoint, superpoint_lightglue_fused, "
+        "disk_lightglue_fused, or one of your own in the models folder",
+    )
+    yaw_step: float = Field(4.0, gt=0, le=30, description="step of the search over all yaws, degrees")
+    patch: float = Field(24.0, gt=0, description="edge of a patch of the local matches, metres")
+    reach: float = Field(6.0, gt=0, description="how far a patch may lie from the hypothesis, metres")
+    min_overlap: float = Field(400.0, ge=0, description="smallest overlap considered, square metres")
+    prior: Literal["none", "georef"] = Field(
+        "none", description="georef starts from where both clouds' CRSs put them, and searches only near it"
+    )
+    prior_sigma: float = Field(
+        5.0, gt=0, description="standard deviation of the source's place under the prior, metres"
+    )
+    prior_yaw: float = Field(5.0, gt=0, le=180, description="largest turn from the prior considered, degrees")
+    models: Path | None = Field(
+        None, description="folder of model files; the environment variable MTPCR_GEO_MODELS if not given"
+    )
+    turns: int = Field(
+        8, ge=1, le=72, description="orientations in which learned matchers are tried, round the circle"
+    )
+    tolerance: float | None = Field(
+        None,
+        gt=0,
+        description="plan distance within which keypoint matches agree on an orientation, metres; 1.5 cells "
+        "if not given",
+    )
+    max_keypoints: int | None = Field(
+        None, ge=8, description="keypoints of an image at most; the matcher's own if not given"
+    )
+    tile: int | None = Field(
+        None,
+        ge=128,
+        description="edge of the tiles in which learned extractors work, pixels; the model's if not given",
+    )
+    ratio: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="nearest over second nearest descriptor distance at most; 0.9 or the model's own if not "
+        "given, 1 turns it off",
+    )
+    cross_check: bool | None = Field(
+        None, description="nearest neighbours must be mutual; the matcher's own if not given"
+    )
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        "auto", description="where learned matchers run; auto takes CUDA where onnxruntime offers it"
+    )
+    threads: int = Field(
+        0, ge=0, description="threads of learned matchers on the processor; 0 takes all cores"
+    )
+    seed: int = Field(0, ge=0, description="seed of the random choices")
+
+
+class Match(Stage):
+    """Find point pairs in the two rasters, at any yaw."""
+
+    type: ClassVar[str] = "mtpcr.match"
+    Options: ClassVar[OptionsModel] = MatchOptions
+    options: MatchOptions
+
+    _matcher: Matcher | None = None
+
+    def check(self, context: RunContext) -> None:
+        """Find out whether there is such a matcher, with its files, and whether the options are its own."""
+        correlation = self.options.method == "correlation"
+        foreign = self.options.model_fields_set & (_OF_KEYPOINTS if correlation else _OF_CORRELATION)
+        # words equal to the default say nothing
+        fields = type(self.options).model_fields
+        told = sorted(name for name in foreign if getattr(self.options, name) != fields[name].default)
+        if told:
+            kind = "keypoint matchers" if correlation else "correlation"
+            raise OptionError(
+                f"{self.label}: option {told[0]!r} is one of {kind}; the method is {self.options.method!r}"
+            )
+        if not correlation:
+            self._matcher = self._make(None)
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Match the source's raster to the target's."""
+        pair = self.one_pair(inputs)
+        source, target = bevs_of(self, pair)
+        prior = self._prior(pair)
+        matcher = self._matcher or self._make(prior)
+        if matcher.needs_one_cell and source.grid.cell != target.grid.cell:
+            raise OptionError(
+                f"{self.label}: {self.options.method} needs one cell size, and the rasters have "
+                f"{source.grid.cell:g} and {target.grid.cell:g} m; set resolution to common in mtpcr.bev"
+            )
+        if matcher.needs_image:
+            pair = pair.with_(source=_shown(pair.source), target=_shown(pair.target))
+        yaw = None
+        if prior is not None and self.options.prior_yaw <= BORNE_TURN_DEG:
+            yaw = prior.hypothesis.yaw
+        with context.progress.task("searching all yaws" if prior is None else "searching", None) as advance:
+            matches = matcher.match(
+                view_of(pair.source, matcher.needs_image),
+                view_of(pair.target, matcher.needs_image),
+                seed=self.options.seed,
+                yaw=yaw,
+                advance=advance,
+            )
+        self.metadata |= {"matches": len(matches.score), **matches.report}
+        known = None if prior is None else georeference(pair, self.label)
+        return pair.with_(matches=replace(matches, matcher=matcher), T_prior=known)
+
+    def _make(self, prior: Prior | None) -> Matcher:
+        from mtpcr_geo.match.correlation import CorrelationSettings
+        from mtpcr_geo.match.registry import CorrelationMatcher, KeypointSettings, make_matcher
+
+        o = self.options
+        correlation = CorrelationSettings(
+            yaw_step_deg=o.yaw_step, patch_m=o.patch, reach_m=o.reach, min_overlap_m2=o.min_overlap
+        )
+        if o.method == "correlation":
+            return CorrelationMatcher(correlation, prior)
+        keypoints = KeypointSettings(
+            models=o.models,
+            turns=o.turns,
+            tolerance_m=o.tolerance,
+            max_keypoints=o.max_keypoints,
+            tile=o.tile,
+            ratio=o.ratio,
+            cross_check=o.cross_check,
+            device=o.device,
+            threads=o.threads,
+        )
+        return make_matcher(o.method, correlation, keypoints)
+
+    def _prior(self, pair: Pair) -> Prior | None:
+        """Turn the shared georeference into a hypothesis between the levelled clouds."""
+        from mtpcr_geo.core.types import Hypothesis
+        from mtpcr_geo.match.correlation import Prior
+
+        if self.options.prior == "none":
+            return None
+        T = georeference(pair, self.label)
+        T_level = pair.target.T_level_work @ T @ transforms.inverse(pair.source.T_level_work)
+        shift = (float(T_level[0, 3]), float(T_level[1, 3]))
+        known = Hypothesis(transforms.yaw_of(T_level[:3, :3]), shift, 0.0)
+        return Prior(known, 3.0 * self.options.prior_sigma, float(np.radians(self.options.prior_yaw)))
+
+
+class FocusOptions(StageOptions):
+    """Options of mtpcr.focus."""
+
+    theta: float = Field(
+        0.3,
+        ge=0,
+        le=1,
+        description="overlap below which is matched again, as a share of the less covered cloud; the paper "
+        "gives no value",
+    )
+    finer: float = Field(2.0, ge=1, le=16, description="by which the cells are divided")
+    radius: float = Field(25.0, gt=0, description="of the neighbourhood of a match, metres")
+    finest: float = Field(0.25, gt=0, description="cells are made no finer than this, metres")
+    seed: int = Field(0, ge=0, description="seed of the random choices")
+
+
+class Focus(Stage):
+    """Match again at finer cells around the first matches, where the overlap is small (FOCUS)."""
+
+    type: ClassVar[str] = "mtpcr.focus"
+    Options: ClassVar[OptionsModel] = FocusOptions
+    options: FocusOptions
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Ask the matcher of the first pass again."""
+        from mtpcr_geo.method.focus import FocusSettings, Subject, focus
+
+        pair = self.one_pair(inputs)
+        source, target = bevs_of(self, pair)
+        first = pair.matches
+        if first is None or first.matcher is None:
+            raise OptionError(f"{self.label} needs matches; put mtpcr.match before it")
+        look = _look_of(pair.source)
+        settings = FocusSettings(
+            self.options.theta, self.options.finer, self.options.radius, self.options.finest
+        )
+        with context.progress.task("matching again", None) as advance:
+            matches = focus(
+                first.matcher,
+                first,
+                Subject(pair.source.levelled_sample, source.grid),
+                Subject(pair.target.levelled_sample, target.grid),
+                lambda bev: _view(bev, look if first.matcher.needs_image else None),
+                settings,
+                self.options.seed,
+                advance,
+            )
+        self.metadata |= matches.report["focus"]
+        return pair.with_(matches=matches)
+
+
+def _shown(side: Side) -> Side:
+    """Give the side with an image of its raster, so that what was matched is on record."""
+    from mtpcr_geo.method.images import image_of
+    from mtpcr_geo.method.paper import grey
+
+    assert side.bev is not None
+    known = side.appearance
+    if known is not None and known.image.shape == side.bev.grid.shape:
+        return side
+    look = _look_of(side)
+    return replace(side, appearance=Appearance(look, grey(side.bev), image_of(side.bev, look)))
+
+
+def view_of(side: Side, with_image: bool) -> View:
+    """Give what a matcher sees of a side: its raster, and its image where one is wanted."""
+    from mtpcr_geo.match.base import View
+    from mtpcr_geo.method.images import empty_grey
+
+    assert side.bev is not None
+    shown = _shown(side).appearance if with_image else None
+    return View(side.bev) if shown is None else View(side.bev, shown.image, empty_grey(shown.look))
+
+
+def _view(bev: Bev, look: Look | None) -> View:
+    from mtpcr_geo.match.base import View
+    from mtpcr_geo.method.images import empty_grey, image_of
+
+    return View(bev) if look is None else View(bev, image_of(bev, look), empty_grey(look))
+
+
+def _look_of(side: Side) -> Look:
+    # a pipeline without mtpcr.enhance shows band-passed heights
+    return side.appearance.look if side.appearance is not None else "band_pass"

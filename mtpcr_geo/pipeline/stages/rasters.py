@@ -1,0 +1,249 @@
+"""Bringing clouds into the work frame, upright, and onto rasters: the stages before any matching."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.cloud import Cloud
+from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.types import Pair, Side
+from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
+
+if TYPE_CHECKING:
+    from mtpcr_geo.crs import FrameLink, WorkFrame
+    from mtpcr_geo.method.bev import Density
+
+Floats = NDArray[np.float64]
+
+
+class LevelOptions(StageOptions):
+    """Options of mtpcr.level."""
+
+    method: Literal["auto", "ransac", "none"] = Field(
+        "auto",
+        description="how to make clouds upright: auto trusts the vertical of a georeferenced cloud and "
+        "levels a local one by ground and vertical structure; ransac turns the ground plane horizontal; "
+        "none keeps them",
+    )
+    target_crs: str | None = Field(
+        None, description="CRS of the first cloud instead of what it states, or local"
+    )
+    source_crs: str | None = Field(
+        None, description="CRS of the second cloud instead of what it states, or local"
+    )
+    local: bool = Field(False, description="all clouds are local, in metres, whatever they state")
+    vertical: Literal["refuse", "assume-same", "estimate"] = Field(
+        "refuse",
+        description="what to do with different or unknown vertical datums: refuse them, take them as the "
+        "same, or take heights as they are and leave the offset to the registration",
+    )
+    out_crs: str | None = Field(None, description="CRS of the result, where it shall not be the target's")
+    budget: int = Field(
+        4_000_000, ge=1000, description="points of each cloud to work on; rasters always use all points"
+    )
+    seed: int = Field(0, ge=0, description="seed of the random choices")
+
+
+class Level(Stage):
+    """Bring clouds into the work frame and make them upright.
+
+    Takes two clouds, the fixed one (target) first as in PDAL's filters.icp, or one cloud for a raster alone.
+    """
+
+    type: ClassVar[str] = "mtpcr.level"
+    Options: ClassVar[OptionsModel] = LevelOptions
+    options: LevelOptions
+
+    def check_inputs(self, inputs: Sequence[Value], context: RunContext) -> None:
+        """Settle the frames from the headers, so that a CRS that does not do is known before the run."""
+        from mtpcr_geo.io.las import check_distinct
+
+        clouds = [value for value in inputs if isinstance(value, Cloud)]
+        if len(clouds) in (1, 2) and all(cloud.count for cloud in clouds):
+            self._frames(clouds[0], clouds[-1])
+        if len(clouds) == 2:
+            check_distinct(*clouds)
+
+    def _frames(self, target: Cloud, source: Cloud) -> tuple[WorkFrame, FrameLink, FrameLink]:
+        from mtpcr_geo.crs import resolve_frames
+
+        return resolve_frames(
+            target,
+            source,
+            target_crs=self.options.target_crs,
+            source_crs=self.options.target_crs if source is target else self.options.source_crs,
+            local=self.options.local,
+            vertical=self.options.vertical,
+            out_crs=self.options.out_crs,
+        )
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Scan, sample and level each cloud."""
+        from mtpcr_geo.io.las import check_distinct
+        from mtpcr_geo.io.sample import scan
+        from mtpcr_geo.method.levelling import level
+
+        clouds = [value for value in inputs if isinstance(value, Cloud)]
+        if len(clouds) != len(inputs) or len(clouds) not in (1, 2):
+            raise OptionError(f"{self.label} takes two clouds, the fixed one first, or one; set its inputs")
+        target, source = clouds[0], clouds[-1]
+        if len(clouds) == 2:
+            check_distinct(target, source)
+        options = self.options
+        found = [
+            scan(cloud, budget=options.budget, seed=options.seed, progress=context.progress)
+            for cloud in clouds
+        ]
+        frame, *links = self._frames(target, source)
+        sides = []
+        for role, cloud, link, looked in zip(("target", "source"), clouds, links, found, strict=False):
+            sample = in_work_frame(link, looked.sample)
+            upright = level(sample, options.method, link.file_crs is not None, options.seed)
+            self.metadata[role] = {
+                "points": looked.count,
+                "noise_points": looked.dropped,
+                "sampled": len(looked.sample),
+                **upright.report,
+            }
+            sides.append(
+                Side(
+                    role,  # type: ignore[arg-type]
+                    cloud,
+                    link,
+                    sample,
+                    upright.T_level_work,
+                    {**upright.report, "complete": looked.complete},
+                )
+            )
+        return Pair(sides[0], sides[-1], frame)
+
+
+def in_work_frame(link: FrameLink, xyz: Floats) -> Floats:
+    """Take (n, 3) file coordinates to work coordinates, rounded to 10 micrometres.
+
+    Far from the origin a float64 coordinate carries nanometres of noise, and points that a LAS scale puts
+    exactly on the line between two cells would fall to either side by it.
+    """
+    return np.round(link.to_work(xyz), 5)
+
+
+class BevOptions(StageOptions):
+    """Options of mtpcr.bev."""
+
+    cell: float | None = Field(
+        None,
+        gt=0,
+        allow_inf_nan=False,
+        description="edge of a raster cell in metres; chosen from both clouds' densities if not given",
+    )
+    finest: float = Field(
+        1.0, ge=0.25, le=8, allow_inf_nan=False, description="no finer cell is chosen than this, metres"
+    )
+    resolution: Literal["common", "eq1", "eq1_occupied"] = Field(
+        "common",
+        description="one cell for both clouds, or a cell of its own for each by the paper's Eq. 1, from "
+        "points per area of the bounding box or of the occupied ground",
+    )
+    gamma: float | None = Field(
+        None,
+        gt=0,
+        allow_inf_nan=False,
+        description="the gamma of Eq. 1, metres; if not given, such that the geometric mean of both cells is "
+        "the cell given, or the one that would be chosen",
+    )
+    pixel: Literal["centre", "ceil"] = Field(
+        "centre",
+        description="which points a cell holds: our pixel centres, or the paper's ceiling (Eq. 2)",
+    )
+
+
+class MakeBev(Stage):
+    """Rasterise highest z, lowest z and point count of each cloud (Eq. 2), streamed."""
+
+    type: ClassVar[str] = "mtpcr.bev"
+    Options: ClassVar[OptionsModel] = BevOptions
+    options: BevOptions
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Choose the cell and rasterise both sides."""
+        from mtpcr_geo.method.bev import Rasteriser, density, grid_around
+        from mtpcr_geo.method.paper import CeilRasteriser, ceil_grid
+
+        pair = self.one_pair(inputs)
+        sides = [pair.target] if pair.source is pair.target else [pair.target, pair.source]
+        densities = [density(side.sample, side.cloud.count) for side in sides]
+        cells = self._cells(sides, densities)
+        self.metadata |= {"cell_m": cells[-1], "cell_chosen": self.options.cell is None}
+        made = []
+        for side, dense, cell in zip(sides, densities, cells, strict=True):
+            levelled = side.levelled_sample
+            low, high = transforms.bounds(levelled)
+            whole = bool(side.level_report.get("complete", True))
+            if not whole:
+                # the sample may miss the outermost points
+                low, high = _levelled_bounds(side)
+            chunks = [levelled] if whole else _levelled_chunks(side, context)
+            if self.options.pixel == "ceil":
+                raster: Rasteriser = CeilRasteriser(ceil_grid(low, high, cell))
+            else:
+                raster = Rasteriser(grid_around(low, high, cell))
+            for chunk in chunks:
+                raster.add(chunk)
+            bev = raster.finish()
+            made.append(bev)
+            self.metadata[side.role] = {
+                "cell_m": cell,
+                "width": bev.grid.width,
+                "height": bev.grid.height,
+                "filled_share": float((bev.count > 0).mean()),
+                "points_per_m2": dense.per_m2,
+                "area_m2": dense.area_m2,
+            }
+        done = [replace(side, bev=bev) for side, bev in zip(sides, made, strict=True)]
+        return pair.with_(target=done[0], source=done[-1])
+
+    def _cells(self, sides: list[Side], densities: list[Density]) -> list[float]:
+        """Choose the cell of each side: one for both, or by Eq. 1."""
+        from mtpcr_geo.method import paper
+        from mtpcr_geo.method.bev import choose_cell
+
+        usual = self.options.cell or choose_cell(*densities, finest=self.options.finest)
+        if self.options.resolution == "common":
+            return [usual] * len(sides)
+        areas = [dense.area_m2 for dense in densities]
+        if self.options.resolution == "eq1":
+            spans = [np.subtract(*transforms.bounds(side.levelled_sample)[::-1]) for side in sides]
+            areas = [float(span[0] * span[1]) for span in spans]
+        counts = [side.cloud.count for side in sides]
+        gamma = self.options.gamma or paper.usual_gamma(
+            tuple(n / area for n, area in zip(counts, areas, strict=True)), usual
+        )
+        self.metadata["gamma_m"] = gamma
+        res = [paper.resolution(n, area, gamma) for n, area in zip(counts, areas, strict=True)]
+        return [paper.cell_of(one) for one in res]
+
+
+def _levelled_chunks(side: Side, context: RunContext) -> Iterator[Floats]:
+    from mtpcr_geo.io.sample import surface_chunks
+
+    with context.progress.task(f"rasterising {side.cloud.name}", side.cloud.count) as advance:
+        for xyz in surface_chunks(side.cloud):
+            yield transforms.apply(side.T_level_work, in_work_frame(side.link, xyz))
+            advance(len(xyz))
+
+
+def _levelled_bounds(side: Side) -> tuple[Floats, Floats]:
+    """Bounds of the whole cloud once levelled, from the corners of its box: a little generous."""
+    low, high = side.cloud.minimum, side.cloud.maximum
+    corners = np.array(
+        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+    )
+    placed = transforms.apply(side.T_level_work, side.link.to_work(corners))
+    return placed.min(axis=0), placed.max(axis=0)

@@ -1,0 +1,63 @@
+"""The common case in one stage: two clouds in, a judged registration out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+from mtpcr_geo.pipeline.options import MethodOptions
+from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
+from mtpcr_geo.pipeline.steps import steps_of
+
+
+class RegisterStageOptions(MethodOptions, StageOptions):
+    """Options of mtpcr.register: those of the method, from levelling to verdict."""
+
+
+class Register(Stage):
+    """Register the second cloud to the first, as in PDAL's filters.icp: the fixed one comes first.
+
+    Does what mtpcr.level to mtpcr.assess do one by one; mtpcr.apply behind it gives the moved cloud.
+    """
+
+    type = "mtpcr.register"
+    Options: ClassVar[OptionsModel] = RegisterStageOptions
+    options: RegisterStageOptions
+
+    def __init__(self, options: StageOptions, tag: str) -> None:
+        super().__init__(options, tag)
+        self.steps = [self._step(words) for words in steps_of(self.options)]
+
+    def check(self, context: RunContext) -> None:
+        """Check every step."""
+        for step in self.steps:
+            step.check(context)
+
+    def check_inputs(self, inputs: Sequence[Value], context: RunContext) -> None:
+        """Check the clouds as the first step does."""
+        self.steps[0].check_inputs(inputs, context)
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Run the steps in turn."""
+        value: Value | None = None
+        seconds: dict[str, float] = {}
+        for step in self.steps:
+            start = time.perf_counter()
+            value = step.run(inputs, context)
+            seconds[step.type] = time.perf_counter() - start
+            self.metadata[step.type] = step.metadata
+            inputs = [] if value is None else [value]
+            # the recording shows each step; this stage as a whole comes after
+            context.recorder.after(
+                step.type, self.tag, step.options.model_dump(mode="json"), value, seconds[step.type]
+            )
+        self.metadata["time_s"] = seconds
+        return value
+
+    def _step(self, words: dict[str, Any]) -> Stage:
+        from mtpcr_geo.pipeline.registry import make_options, stage_types
+
+        kind = stage_types()[words["type"]]
+        given = {key: value for key, value in words.items() if key not in ("type", "tag", "inputs")}
+        return kind(make_options(self.label, kind.Options, given), f"{self.tag}_{words['tag']}")

@@ -1,0 +1,314 @@
+"""The steps of the method as stages, from lifting to the verdict: thin, each calling its room."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.types import Bev, Pair
+from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
+
+Floats = NDArray[np.float64]
+
+
+def georeference(pair: Pair, label: str) -> Floats:
+    """Give the 4x4 from source to target work coordinates that both CRSs claim.
+
+    Raises:
+        OptionError: if a cloud has no CRS to claim it by.
+
+    """
+    if pair.frame.crs is None or pair.source.link.file_crs is None:
+        raise OptionError(
+            f"{label}: a prior from the georeference needs a CRS on both clouds; name it by --source-crs and "
+            "--target-crs, or search without a prior"
+        )
+    return transforms.translation(pair.source.link.origin - pair.target.link.origin)
+
+
+def bevs_of(stage: Stage, pair: Pair) -> tuple[Bev, Bev]:
+    """Give both rasters, source first.
+
+    Raises:
+        OptionError: if the pair has none, or is one cloud.
+
+    """
+    if pair.source is pair.target:
+        raise OptionError(f"{stage.label} needs two clouds; give mtpcr.level a target and a source")
+    if pair.source.bev is None or pair.target.bev is None:
+        raise OptionError(f"{stage.label} needs height rasters; put mtpcr.bev before it")
+    return pair.source.bev, pair.target.bev
+
+
+class LiftOptions(StageOptions):
+    """Options of mtpcr.lift."""
+
+    surface: Literal["ground", "top", "grey"] = Field(
+        "ground",
+        description="height of a tie: the lowest z around it, the highest z of its cell, or that in 255 "
+        "steps (the paper's Eq. 5)",
+    )
+    pixel: Literal["centre", "ceil"] = Field(
+        "centre",
+        description="where in its cell a pixel lies: the centre, or the north-east corner (Eq. 5)",
+    )
+    folds: int = Field(
+        4,
+        ge=2,
+        le=20,
+        description="parts of the ties' ground; the first is withheld from the solve to judge it by",
+    )
+    block: float = Field(40.0, gt=0, description="edge of the blocks in which ties are withheld, metres")
+    seed: int = Field(0, ge=0, description="seed that chooses the withheld blocks")
+
+
+class Lift(Stage):
+    """Map matches back to 3D in metres (Eq. 5), and set some aside to judge by."""
+
+    type: ClassVar[str] = "mtpcr.lift"
+    Options: ClassVar[OptionsModel] = LiftOptions
+    options: LiftOptions
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Lift the matches to ties."""
+        from mtpcr_geo.method.inverse_mapping import lift
+
+        pair = self.one_pair(inputs)
+        source, target = bevs_of(self, pair)
+        if pair.matches is None:
+            raise OptionError(f"{self.label} needs matches; put mtpcr.match before it")
+        ties = lift(
+            pair.matches,
+            source,
+            target,
+            surface=self.options.surface,
+            pixel=self.options.pixel,
+            folds=self.options.folds,
+            block_m=self.options.block,
+            seed=self.options.seed,
+        )
+        self.metadata |= {"ties": len(ties.score), "withheld": int(ties.withheld.sum())}
+        return pair.with_(ties=ties)
+
+
+class SolveOptions(StageOptions):
+    """Options of mtpcr.solve."""
+
+    tolerance: float | None = Field(
+        None, gt=0, description="plan residual up to which ties agree, metres; 1.5 cells if not given"
+    )
+    upright: bool = Field(
+        True, description="solve yaw and shift, trusting the levelling; else all six degrees of freedom"
+    )
+    robust_start: bool = Field(
+        True,
+        description="start from the yaw and shift most ties agree on (RANSAC); else from all (the paper)",
+    )
+    tries: int = Field(
+        2000, ge=1, description="pairs of ties tried for the robust start; more where few of them are right"
+    )
+    seed: int = Field(0, ge=0, description="seed of the robust start")
+
+
+class Solve(Stage):
+    """Solve the rigid transform from the ties: iterative SVD with outlier rejection."""
+
+    type: ClassVar[str] = "mtpcr.solve"
+    Options: ClassVar[OptionsModel] = SolveOptions
+    options: SolveOptions
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Solve in levelled coordinates, and compose both levelling rotations into the result."""
+        from mtpcr_geo.method.solve import solve_ties
+
+        pair = self.one_pair(inputs)
+        bevs_of(self, pair)
+        if pair.ties is None:
+            raise OptionError(f"{self.label} needs ties; put mtpcr.lift before it")
+        ties = pair.ties
+        tolerance = self.options.tolerance or 1.5 * pair.cell
+        solution, inlier = solve_ties(
+            ties.source,
+            ties.target,
+            ties.score,
+            ties.withheld,
+            tolerance=tolerance,
+            robust_start=self.options.robust_start,
+            upright=self.options.upright,
+            tries=self.options.tries,
+            seed=self.options.seed,
+        )
+        T_work_level = transforms.inverse(pair.target.T_level_work)
+        T = T_work_level @ solution.T @ pair.source.T_level_work
+        report = {
+            "used": int((~ties.withheld).sum()),
+            "inliers": int(solution.inlier.sum()),
+            "iterations": solution.iterations,
+            "threshold_m": solution.threshold,
+            "yaw_deg": float(np.degrees(transforms.yaw_of(solution.T[:3, :3]))),
+            "settings": {
+                "robust_start": self.options.robust_start,
+                "upright": self.options.upright,
+                "tries": self.options.tries,
+                "seed": self.options.seed,
+            },
+        }
+        self.metadata |= report
+        return pair.with_(T_target_source=T, ties=replace(ties, inlier=inlier), solve_report=report)
+
+
+class RefineOptions(StageOptions):
+    """Options of mtpcr.refine."""
+
+    method: Literal["gicp", "point_to_plane", "point_to_point", "none"] = Field(
+        "gicp", description="ICP variant; point_to_point is what the paper cites"
+    )
+    voxel: float = Field(0.5, gt=0, description="thinning of the points, metres; grows with large overlaps")
+    reach: list[float] | None = Field(
+        None,
+        min_length=1,
+        description="farthest correspondence of each round, metres; if not given, far and near rounds are "
+        "tried, and what the surfaces fit best is taken",
+    )
+    max_points: int = Field(
+        30_000,
+        ge=200,
+        description="points of the source after thinning; the target may have three times as many",
+    )
+    iterations: int = Field(30, ge=1, description="iterations of each round at most")
+    motion: Literal["rigid", "yaw", "translation"] = Field(
+        "rigid", description="degrees of freedom of the result: all six, yaw and shift, or the shift alone"
+    )
+    ground: bool = Field(True, description="settle height and tilt on the ground before, and height after")
+    keep_ties: float = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="share of the agreeing ties that must still agree after ICP for it to be followed; on "
+        "open ground it may slide. 0 to follow it always, however the surfaces fit",
+    )
+
+
+class Refine(Stage):
+    """Refine by ICP on the overlap, with the height settled on the ground."""
+
+    type: ClassVar[str] = "mtpcr.refine"
+    Options: ClassVar[OptionsModel] = RefineOptions
+    options: RefineOptions
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Refine the solved transform."""
+        from mtpcr_geo.method.icp import Rounds, Surfaces, rounds_for
+        from mtpcr_geo.method.refine import beyond_scatter, constrain, follow_icp, settle_on_ground
+        from mtpcr_geo.verdict.evidence import ties_agreeing
+
+        pair = self.one_pair(inputs)
+        if pair.T_target_source is None:
+            raise OptionError(f"{self.label} needs a transform; put mtpcr.solve before it")
+        source, target, T = pair.source.sample, pair.target.sample, pair.T_target_source
+        report: dict[str, object] = {}
+        starts = {"ties": T}
+        if self.options.ground:
+            settled = settle_on_ground(source, target, T, tilt=True)
+            T, report["ground_before"] = settled.T, settled.report
+            starts["ground"] = T
+        if self.options.method != "none":
+            reach = self.options.reach
+            rounds = {"asked": Rounds(tuple(reach))} if reach else rounds_for(pair.cell)
+            surfaces = Surfaces(
+                source,
+                target,
+                T,
+                voxel_m=self.options.voxel,
+                reach_m=max(max(one.reach_m) for one in rounds.values()),
+                most_points=self.options.max_points,
+            )
+            refined = follow_icp(
+                surfaces,
+                starts,
+                rounds=rounds,
+                agreeing=lambda T: ties_agreeing(pair, T),
+                keep_ties=self.options.keep_ties,
+                method=self.options.method,
+                iterations=self.options.iterations,
+            )
+            T, report["icp"] = refined.T, refined.report
+        if self.options.ground:
+            settled = settle_on_ground(source, target, T, tilt=False)
+            followed = self.options.method == "none" or beyond_scatter(settled)
+            report["ground_after"] = {**settled.report, "followed": followed}
+            T = settled.T if followed else T
+        if self.options.motion != "rigid" and pair.ties is not None:
+            T_work_level = transforms.inverse(pair.source.T_level_work)
+            pivot = transforms.apply(T_work_level, pair.ties.source.mean(axis=0, keepdims=True))[0]
+            upright = transforms.inverse(pair.target.T_level_work)[:3, :3] @ pair.source.T_level_work[:3, :3]
+            T = constrain(T, self.options.motion, pivot, upright)
+        self.metadata |= report
+        return pair.with_(T_target_source=T, refine_report={**report, "T_before": pair.T_target_source})
+
+
+class AssessOptions(StageOptions):
+    """Options of mtpcr.assess."""
+
+    tolerance: float | None = Field(
+        None,
+        gt=0,
+        description="plan distance within which a withheld tie agrees, metres; if not given one cell, or two "
+        "for keypoint matchers",
+    )
+    surprise: float = Field(
+        6.0, ge=0, description="digits of improbability of the withheld ties' agreement wanted to accept"
+    )
+    margin: float = Field(
+        1.3, ge=1, description="strength over the next distinct hypothesis wanted to accept"
+    )
+    agreeing: float = Field(0.15, ge=0, le=1, description="share of withheld ties that must agree to accept")
+    min_overlap: float = Field(400.0, ge=0, description="overlap wanted to accept, square metres")
+
+
+class Assess(Stage):
+    """Judge the result by what the fit did not see: accepted, doubtful or refused, with reasons."""
+
+    type: ClassVar[str] = "mtpcr.assess"
+    Options: ClassVar[OptionsModel] = AssessOptions
+    options: AssessOptions
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Gather the evidence and judge."""
+        from mtpcr_geo.verdict.decision import Limits, assess
+        from mtpcr_geo.verdict.evidence import gather
+
+        pair = self.one_pair(inputs)
+        if pair.T_target_source is None or pair.ties is None:
+            raise OptionError(f"{self.label} needs a transform and ties; put mtpcr.solve before it")
+        options = self.options
+        pair = self._no_worse_than_prior(pair)
+        evidence, more = gather(pair, options.tolerance)
+        limits = Limits(
+            surprise=options.surprise,
+            agreeing=options.agreeing,
+            margin=options.margin,
+            overlap_m2=options.min_overlap,
+        )
+        verdict = assess(evidence, limits, more)
+        self.metadata |= {"verdict": verdict.name, "reasons": list(verdict.reasons), **verdict.metrics}
+        return pair.with_(verdict=verdict)
+
+    def _no_worse_than_prior(self, pair: Pair) -> Pair:
+        """Keep the transform known beforehand where more ties and as much ground agree with it."""
+        from mtpcr_geo.verdict.evidence import agreement
+
+        if pair.T_prior is None or pair.T_target_source is None:
+            return pair
+        found = agreement(pair, pair.T_target_source, self.options.tolerance)
+        known = agreement(pair, pair.T_prior, self.options.tolerance)
+        better = known[0] >= found[0] and known[1] >= found[1]
+        self.metadata |= {"ties_and_ground_agreeing": found, "with_prior": known, "prior_kept": better}
+        return pair.with_(T_target_source=pair.T_prior) if better else pair

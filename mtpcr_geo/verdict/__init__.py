@@ -1,0 +1,1 @@
+"""Whether a registration may be believed: evidence, and the decision made of it."""

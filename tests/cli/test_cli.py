@@ -1,0 +1,215 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import mtpcr_geo
+from mtpcr_geo.cli.app import app
+
+HEAVY = {
+    "numpy",
+    "laspy",
+    "rasterio",
+    "pyproj",
+    "pydantic",
+    "rich",
+    "scipy",
+    "cv2",
+    "open3d",
+    "rerun",
+    "pdal",
+}
+
+
+def run(*arguments: object, stdin: bytes | None = None):
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments], input=stdin)
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result
+
+
+def one_line(result) -> str:
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1, result.stderr
+    return lines[0]
+
+
+@pytest.mark.parametrize("arguments", [["-c", "import mtpcr_geo"], ["-m", "mtpcr_geo.cli.app", "--help"]])
+def test_starting_loads_nothing_heavy(arguments):
+    code = (
+        "import sys\n"
+        f"sys.argv = {['mtpcr-geo', *arguments[2:]]!r}\n"
+        "try:\n"
+        f"    {'import mtpcr_geo' if arguments[0] == '-c' else 'import mtpcr_geo.cli.app as c; c.main()'}\n"
+        "except SystemExit:\n    pass\n"
+        f"print(sorted({HEAVY!r} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_help_names_every_verb():
+    text = run("--help").stdout
+    assert all(verb in text for verb in ("register", "apply", "demo", "pipeline"))
+
+
+def test_version():
+    assert mtpcr_geo.__version__ in run("--version").stdout
+
+
+def test_register_prints_verdict_and_files(town_files, tmp_path):
+    source, target = town_files
+    result = run("register", source, target, "-o", tmp_path / "out", "--no-recording")
+    assert result.exit_code == 0
+    assert "ACCEPTED" in result.stdout
+    assert "registered.laz" in result.stdout
+    assert result.stderr == ""
+    assert not (tmp_path / "out" / "audit.rrd").exists()
+
+
+def test_register_as_json_and_quiet(town_files, tmp_path):
+    source, target = town_files
+    result = run("register", source, target, "-o", tmp_path / "a", "--no-recording", "--json")
+    assert json.loads(result.stdout)["verdict"] == "accepted"
+    quiet = run("register", source, target, "-o", tmp_path / "b", "--no-recording", "--quiet")
+    assert (quiet.exit_code, quiet.output) == (0, "")
+
+
+def test_dump_pipeline_runs_and_gives_the_same_bits(town_files, tmp_path):
+    source, target = town_files
+    dumped = run(
+        "register", source, target, "-o", tmp_path / "b", "--no-recording", "--seed", 3, "--dump-pipeline"
+    )
+    assert not (tmp_path / "b").exists()
+    first = run("register", source, target, "-o", tmp_path / "a", "--no-recording", "--seed", 3, "--quiet")
+    second = run("pipeline", "-", "--quiet", stdin=dumped.stdout.encode())
+    assert first.exit_code == second.exit_code == 0
+    for name in ("registered.laz", "transform.cloudcompare.txt", "bev/target.tif"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+@pytest.mark.parametrize(("verdict", "code"), [("doubtful", 3), ("refused", 4)])
+def test_exit_code_says_the_verdict(verdict, code, town_files, tmp_path, monkeypatch):
+    from mtpcr_geo.core.types import Verdict
+
+    monkeypatch.setattr(
+        "mtpcr_geo.verdict.decision.assess", lambda *a, **k: Verdict(verdict, ("because",), {})
+    )
+    out = tmp_path / "out"
+    result = run("register", *town_files, "-o", out, "--no-recording")
+    assert result.exit_code == code
+    assert verdict.upper() in result.stdout
+    assert "because" in result.stdout
+    assert (out / "registered.laz").exists() == (verdict == "doubtful")
+    assert (out / "transform.json").exists() == (verdict == "doubtful")
+    assert (out / "run.json").exists()
+    forced = run("register", *town_files, "-o", out, "--no-recording", "--force", "--overwrite")
+    assert forced.exit_code == code
+    assert (out / "registered.laz").exists()
+
+
+def test_register_says_no_to_bad_words(town_files, tmp_path):
+    source, target = town_files
+    out = tmp_path / "out"
+    for words, code in (
+        (["--cell", "-1"], 2),
+        (["--cell", "nan"], 2),
+        (["--profile", "fancy"], 2),
+        (["--seed", "-4"], 2),
+        (["--source-crs", "EPSG:0"], 6),
+    ):
+        result = run("register", source, target, "-o", out, *words)
+        assert result.exit_code == code, words
+        assert one_line(result).startswith("mtpcr-geo: error: ")
+    assert not out.exists()
+
+
+def test_register_does_not_replace_unasked(town_files, tmp_path):
+    (tmp_path / "run.json").write_text("mine")
+    result = run("register", *town_files, "-o", tmp_path, "--no-recording")
+    assert result.exit_code == 7
+    assert "--overwrite" in one_line(result)
+    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+    assert (tmp_path / "run.json").read_text() == "mine"
+
+
+def test_one_cloud_given_twice(town_files, tmp_path):
+    result = run("register", town_files[0], town_files[0], "-o", tmp_path / "out")
+    assert result.exit_code == 5
+    assert "same" in one_line(result)
+    assert not (tmp_path / "out").exists()
+
+
+def test_interrupt_is_quiet_and_leaves_nothing(town_files, tmp_path, monkeypatch):
+    def interrupt(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mtpcr_geo.verdict.decision.assess", interrupt)
+    result = run("register", *town_files, "-o", tmp_path / "out", "--no-recording")
+    assert result.exit_code == 130
+    assert "interrupted" in one_line(result)
+    assert not (tmp_path / "out").exists()
+
+
+def test_apply_there_and_back(town_files, tmp_path):
+    source, target = town_files
+    run("register", source, target, "-o", tmp_path, "--no-recording", "--quiet")
+    assert run("apply", tmp_path / "transform.json", source, tmp_path / "there.laz").exit_code == 0
+    back = run(
+        "apply", tmp_path / "transform.json", tmp_path / "there.laz", tmp_path / "back.laz", "--inverse"
+    )
+    assert back.exit_code == 0
+    before, after = laspy.read(source), laspy.read(tmp_path / "back.laz")
+    np.testing.assert_allclose(np.asarray(after.xyz), np.asarray(before.xyz), atol=0.0021)
+
+
+def test_pipeline_validates_without_running(town_files, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = json.dumps([str(town_files[1]), "out/copy.laz"]).encode()
+    result = run("pipeline", "-", "--validate", stdin=text)
+    assert (result.exit_code, result.stdout) == (0, "the pipeline is valid\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_pipeline_writes_metadata_and_takes_overrides(town_files, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("p.json").write_text(json.dumps([{"type": "readers.las", "filename": "x"}, "copy.laz"]))
+    result = run(
+        "pipeline", "p.json", f"--readers.las.filename={town_files[1]}", "--readers.las.count", 50,
+        "--metadata", "m.json", "-v",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert len(laspy.read("copy.laz")) == 50
+    metadata = json.loads(Path("m.json").read_text())
+    assert metadata["metadata"]["readers.las"]["count"] == 50
+    assert set(metadata["stages"]) == {"readers_las1", "writers_las1"}
+    assert "copy.laz" in result.stdout
+
+
+def test_schema_is_a_schema_that_ready_pipelines_fit():
+    from conftest import REPOSITORY
+
+    from mtpcr_geo.pipeline.grammar import parse
+
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = json.loads(run("pipeline", "--schema").stdout)
+    validator = jsonschema.Draft202012Validator
+    validator.check_schema(schema)
+    for file in sorted((REPOSITORY / "pipelines").glob("*.json")):
+        stages = [
+            {"type": e.type, **({"tag": e.tag} if e.tag else {}), **e.options}
+            for e in parse(file.read_bytes())
+        ]
+        validator(schema).validate(stages)
+    wrong = [{"type": "mtpcr.bev", "cel": 1.0}]
+    assert not validator(schema).is_valid(wrong)
+
+
+def test_pipeline_without_a_file():
+    assert "name a pipeline file" in one_line(run("pipeline"))

@@ -1,0 +1,339 @@
+"""Transform files, and applying them."""
+
+import json
+
+import laspy
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pyproj import CRS, Transformer
+
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.errors import CrsError, InputError, OutputError
+from mtpcr_geo.core.types import Pair, Side
+from mtpcr_geo.crs import TransformChain, resolve_frames
+from mtpcr_geo.export.apply import apply_transform
+from mtpcr_geo.export.transform import (
+    dumps,
+    read_transform,
+    write_cloudcompare_matrix,
+    write_pdal_pipeline,
+    write_transform_json,
+)
+from mtpcr_geo.io import ArrayCloud
+from mtpcr_geo.io.las import open_cloud
+from mtpcr_geo.io.write import write_cloud
+
+UTM, FEET = CRS.from_epsg(2993), CRS.from_epsg(2994)
+GEOGRAPHIC = CRS.from_epsg(4152)  # the datum of both
+PLACE = np.array([194_000.0, 258_800.0, 120.0])
+T_WORK = transforms.compose(
+    transforms.yaw_matrix(0.7) @ transforms.tilt_matrix(0.3, 0.05), np.array([12.5, -7.25, 1.5])
+)
+
+
+def written_in(crs, xyz):
+    """Coordinates of the metric test system in another one, feet up where it is in feet."""
+    columns = Transformer.from_crs(UTM, crs, always_xy=True).transform(*xyz.T)
+    result = np.column_stack(columns)
+    if crs == FEET:
+        result[:, 2] /= 0.3048
+    return result
+
+
+def site(n=600, seed=0, decimals=3):
+    rng = np.random.default_rng(seed)
+    return np.round(PLACE + rng.uniform(0, [300, 200, 30], (n, 3)), decimals)
+
+
+def a_pair(target_crs=UTM, source_crs=UTM, source_path=None, scale=0.001, **options):
+    target = ArrayCloud(written_in(target_crs, site(seed=1)), target_crs, name="target.laz")
+    source = ArrayCloud(
+        written_in(source_crs, site()) if source_crs is not None else site() - PLACE,
+        source_crs,
+        name="source.laz",
+    )
+    if source_path is not None:
+        write_cloud(source_path, source, None, source_crs, scale=scale)
+        source = open_cloud(source_path)
+    frame, target_link, source_link = resolve_frames(target, source, **options)
+    sides = [
+        Side(role, cloud, link, link.to_work(np.concatenate(list(cloud.xyz_chunks()))))
+        for role, cloud, link in (("target", target, target_link), ("source", source, source_link))
+    ]
+    return Pair(target=sides[0], source=sides[1], frame=frame, T_target_source=T_WORK)
+
+
+def file_xyz(cloud):
+    return np.concatenate(list(cloud.xyz_chunks()))
+
+
+KINDS = {
+    "metres": {},
+    "feet to metres": {"source_crs": FEET},
+    "metres to feet": {"target_crs": FEET},
+    "feet": {"target_crs": FEET, "source_crs": FEET},
+    "degrees to metres": {"source_crs": GEOGRAPHIC},
+    "metres to degrees": {"target_crs": GEOGRAPHIC},
+    "local to metres": {"source_crs": None, "source_crs_said": "local"},
+    "metres, out in feet": {"out_crs": FEET},
+}
+
+
+def pair_of(kind, **more):
+    options = dict(KINDS[kind])
+    if "source_crs_said" in options:
+        said = options.pop("source_crs_said")
+        source_crs = options.pop("source_crs")
+        return a_pair_local(said, source_crs, **options, **more)
+    return a_pair(**options, **more)
+
+
+def a_pair_local(said, source_crs, source_path=None, scale=0.001):
+    pair = a_pair()
+    source = ArrayCloud(site() - PLACE, source_crs, name="source.laz")
+    if source_path is not None:
+        write_cloud(source_path, source, None, None, scale=scale)
+        source = open_cloud(source_path)
+    frame, target_link, link = resolve_frames(pair.target.cloud, source, source_crs=said)
+    side = Side("source", source, link, link.to_work(file_xyz(source)))
+    return Pair(
+        target=Side("target", pair.target.cloud, target_link, pair.target.sample),
+        source=side,
+        frame=frame,
+        T_target_source=T_WORK,
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_everything_comes_back_from_the_file(tmp_path, kind):
+    pair = pair_of(kind)
+    write_transform_json(tmp_path / "t.json", pair)
+    chain, again = TransformChain.of(pair), read_transform(tmp_path / "t.json")
+    xyz = file_xyz(pair.source.cloud)
+    assert np.array_equal(again.forward(xyz), chain.forward(xyz))
+    assert np.array_equal(again.T_target_source, T_WORK)
+    back = again.inverse(again.forward(xyz))
+    assert np.allclose(back, xyz, rtol=0, atol=1e-10 if "degrees to" in kind else 1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_matrix_says_the_same_or_how_far_it_is_off(tmp_path, kind):
+    pair = pair_of(kind)
+    write_transform_json(tmp_path / "t.json", pair)
+    data = json.loads((tmp_path / "t.json").read_text())
+    T, xyz = np.array(data["T_target_source"]), file_xyz(pair.source.cloud)
+    chain = TransformChain.of(pair)
+    off = chain.target.to_work(transforms.apply(T, xyz)) - chain.target.to_work(chain.forward(xyz))
+    worst = np.linalg.norm(off, axis=1).max()
+    assert data["exactness"]["exact"] == ("degrees" not in kind)
+    assert worst <= max(1e-6, data["exactness"]["departure_m"] * 1.05)
+    assert data["exactness"]["departure_m"] < 0.05
+    assert np.allclose(np.array(data["T_source_target"]) @ T, np.eye(4), atol=1e-6)
+    pivot = data["pivot"]
+    turned = (xyz - pivot["source"]) @ np.array(pivot["linear"]).T + pivot["target"]
+    assert np.allclose(turned, transforms.apply(T, xyz), rtol=0, atol=0.05 if "degrees" in kind else 1e-6)
+    example = data["example"]
+    assert np.allclose(chain.forward(np.array([example["source"]]))[0], example["target"], rtol=0, atol=1e-9)
+    assert np.allclose(example["source_again"], example["source"], rtol=0, atol=1e-6)
+
+
+def test_the_file_says_its_frames_and_units(tmp_path):
+    write_transform_json(tmp_path / "t.json", a_pair(source_crs=FEET))
+    data = json.loads((tmp_path / "t.json").read_text())
+    assert data["units"] == {"source": ["foot"] * 3, "target": ["metre"] * 3}
+    assert data["chain"]["source"]["crs"]["authority"] == "EPSG:2994"
+    assert data["work"]["crs"]["authority"] == "EPSG:2993"
+    assert data["motion"]["yaw_deg"] == pytest.approx(np.degrees(transforms.yaw_of(T_WORK[:3, :3])))
+    assert data["files"] == {"source": "source.laz", "target": "target.laz"}
+    text = (tmp_path / "t.json").read_text()
+    assert f"{T_WORK[0, 0]:.17g}" in text
+
+
+def test_an_estimated_height_offset_is_reported(tmp_path):
+    target = CRS.from_user_input("EPSG:2993+5703")
+    xyz = site()
+    clouds = ArrayCloud(site(seed=1), target, name="t"), ArrayCloud(xyz, UTM, name="s")
+    frame, target_link, link = resolve_frames(*clouds, vertical="estimate")
+    pair = Pair(
+        target=Side("target", clouds[0], target_link, target_link.to_work(clouds[0].xyz)),
+        source=Side("source", clouds[1], link, link.to_work(xyz)),
+        frame=frame,
+        T_target_source=transforms.translation(link.origin - target_link.origin + np.array([0, 0, -1.25])),
+    )
+    write_transform_json(tmp_path / "t.json", pair)
+    motion = json.loads((tmp_path / "t.json").read_text())["motion"]
+    assert motion["vertical_offset_m"] == pytest.approx(-1.25)
+    assert np.allclose(motion["shift_of_pivot_m"], [0, 0, -1.25], atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["metres", "feet to metres", "local to metres", "metres to feet"])
+def test_cloudcompare_matrix_on_shifted_coordinates(tmp_path, kind):
+    pair = pair_of(kind)
+    write_cloudcompare_matrix(tmp_path / "cc.txt", pair)
+    write_transform_json(tmp_path / "t.json", pair)
+    rows = [line.split() for line in (tmp_path / "cc.txt").read_text().splitlines()]
+    assert [len(row) for row in rows] == [4, 4, 4, 4]
+    matrix = np.array(rows, float)
+    said = json.loads((tmp_path / "t.json").read_text())["cloudcompare"]
+    xyz = file_xyz(pair.source.cloud)
+    # as CloudCompare does: points in single precision, less the shift
+    local = (xyz + said["source_global_shift"]).astype(np.float32).astype(float)
+    placed = transforms.apply(matrix, local) - said["target_global_shift"]
+    assert np.allclose(placed, TransformChain.of(pair).forward(xyz), rtol=0, atol=5e-4)
+    assert np.abs(matrix[:3, 3]).max() < 5000
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "local to metres"])
+def test_pdal_does_the_same(tmp_path, kind):
+    pdal = pytest.importorskip("pdal", reason="PDAL is not installed")
+    pair = pair_of(
+        kind,
+        source_path=tmp_path / "source.las",
+        scale=(1e-9, 1e-9, 0.001) if "degrees to" in kind else 0.001,
+    )
+    write_pdal_pipeline(tmp_path / "p.pdal.json", pair)
+    stages = json.loads((tmp_path / "p.pdal.json").read_text())["pipeline"]
+    pipeline = pdal.Pipeline(json.dumps(stages[:-1]))
+    pipeline.execute()
+    placed = np.column_stack([pipeline.arrays[0][axis] for axis in "XYZ"])
+    expected = TransformChain.of(pair).forward(file_xyz(pair.source.cloud))
+    assert np.allclose(placed, expected, rtol=0, atol=1e-9 if kind.endswith("degrees") else 1e-6)
+
+
+def test_pdal_writes_the_whole_pipeline(tmp_path, monkeypatch):
+    pdal = pytest.importorskip("pdal", reason="PDAL is not installed")
+    pair = a_pair(source_path=tmp_path / "source.laz")
+    write_pdal_pipeline(tmp_path / "p.pdal.json", pair)
+    monkeypatch.chdir(tmp_path)
+    pdal.Pipeline((tmp_path / "p.pdal.json").read_text()).execute()
+    result = open_cloud(tmp_path / "source_registered.laz")
+    expected = TransformChain.of(pair).forward(file_xyz(pair.source.cloud))
+    assert np.allclose(file_xyz(result), expected, rtol=0, atol=0.00051)
+    assert result.crs.to_epsg() == 2993
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_apply_there_and_back_returns_every_point(tmp_path, kind):
+    in_scale = 1e-8 if "degrees to" in kind else 0.001
+    pair = pair_of(kind, source_path=tmp_path / "source.laz", scale=(in_scale, in_scale, 0.001))
+    write_transform_json(tmp_path / "t.json", pair)
+    apply_transform(tmp_path / "t.json", tmp_path / "source.laz", tmp_path / "there.laz")
+    apply_transform(tmp_path / "t.json", tmp_path / "there.laz", tmp_path / "back.laz", inverse=True)
+    there, back = open_cloud(tmp_path / "there.laz"), open_cloud(tmp_path / "back.laz")
+    xyz = file_xyz(pair.source.cloud)
+    chain = TransformChain.of(pair)
+    assert np.all(np.abs(file_xyz(there) - chain.forward(xyz)) <= there.header.scales * 0.51)
+    assert np.all(np.abs(file_xyz(back) - xyz) <= pair.source.cloud.header.scales / 2)
+    wanted = chain.target.file_crs
+    assert there.crs.to_epsg() == wanted.to_epsg()
+    assert (back.crs is None) == (pair.source.cloud.crs is None)
+
+
+@settings(deadline=None, derandomize=True, max_examples=15)
+@given(
+    yaw=st.floats(-np.pi, np.pi),
+    tilt=st.floats(-0.2, 0.2),
+    move=st.tuples(*[st.floats(-500, 500)] * 3),
+    scale=st.sampled_from([0.01, 0.001, 0.0001]),
+)
+def test_apply_there_and_back_whatever_the_transform(tmp_path_factory, yaw, tilt, move, scale):
+    folder = tmp_path_factory.mktemp("apply")
+    T = transforms.compose(transforms.yaw_matrix(yaw) @ transforms.tilt_matrix(yaw, tilt), np.array(move))
+    pair = a_pair(source_path=folder / "source.laz", scale=scale).with_(T_target_source=T)
+    write_transform_json(folder / "t.json", pair)
+    apply_transform(folder / "t.json", folder / "source.laz", folder / "there.laz")
+    apply_transform(folder / "t.json", folder / "there.laz", folder / "back.laz", inverse=True)
+    xyz = file_xyz(pair.source.cloud)
+    assert np.abs(file_xyz(open_cloud(folder / "back.laz")) - xyz).max() <= scale / 2
+
+
+def test_apply_keeps_dimensions(tmp_path):
+    pair = a_pair()
+    extra = {"Intensity": np.arange(600, dtype=np.uint16), "Height": np.linspace(0, 1, 600)}
+    write_cloud(tmp_path / "in.laz", ArrayCloud(site(), UTM, extra=extra), None, UTM)
+    write_transform_json(tmp_path / "t.json", pair)
+    apply_transform(tmp_path / "t.json", tmp_path / "in.laz", tmp_path / "out.copc.laz")
+    las = laspy.read(tmp_path / "out.copc.laz")
+    order = np.argsort(las.intensity)
+    assert np.array_equal(np.asarray(las["Height"])[order], extra["Height"])
+
+
+def test_apply_refuses_what_it_must(tmp_path):
+    pair = a_pair(source_path=tmp_path / "source.laz")
+    write_transform_json(tmp_path / "t.json", pair)
+    write_cloud(tmp_path / "feet.laz", ArrayCloud(written_in(FEET, site()), FEET), None, FEET)
+    with pytest.raises(CrsError, match="starts from"):
+        apply_transform(tmp_path / "t.json", tmp_path / "feet.laz", tmp_path / "out.laz")
+    with pytest.raises(InputError, match="input and output"):
+        apply_transform(tmp_path / "t.json", tmp_path / "source.laz", tmp_path / "source.laz", overwrite=True)
+    (tmp_path / "there.laz").write_text("mine")
+    with pytest.raises(OutputError, match="--overwrite"):
+        apply_transform(tmp_path / "t.json", tmp_path / "source.laz", tmp_path / "there.laz")
+    raw = (tmp_path / "source.laz").read_bytes()
+    (tmp_path / "cut.laz").write_bytes(raw[: len(raw) // 2])
+    with pytest.raises(InputError):
+        apply_transform(tmp_path / "t.json", tmp_path / "cut.laz", tmp_path / "new.laz")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        *("cut.laz", "feet.laz", "source.laz", "t.json", "there.laz")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "not JSON"),
+        ("[]", "not a transform"),
+        ('{"T_target_source": []}', "not a transform"),
+        ('{"type": "mtpcr-geo transform", "version": 99}', "version"),
+        ('{"type": "mtpcr-geo transform", "version": 1}', "damaged"),
+    ],
+)
+def test_other_files_are_no_transforms(tmp_path, text, words):
+    (tmp_path / "t.json").write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_transform(tmp_path / "t.json")
+
+
+def test_a_damaged_transform_is_refused(tmp_path):
+    write_transform_json(tmp_path / "t.json", a_pair())
+    text = (tmp_path / "t.json").read_text()
+    data = json.loads(text)
+    for change in (
+        lambda d: d["work"]["T_target_source"].pop(),
+        lambda d: d["chain"]["source"].pop("origin"),
+        lambda d: d["chain"]["target"]["crs"].update(wkt="nonsense"),
+        lambda d: d["chain"]["target"].update(origin=[1, 2, None]),
+    ):
+        broken = json.loads(text)
+        change(broken)
+        assert broken != data
+        (tmp_path / "broken.json").write_text(json.dumps(broken))
+        with pytest.raises(InputError, match="damaged"):
+            read_transform(tmp_path / "broken.json")
+    with pytest.raises(InputError, match="cannot read"):
+        read_transform(tmp_path / "missing.json")
+
+
+@settings(deadline=None, derandomize=True, max_examples=100)
+@given(
+    value=st.recursive(
+        st.one_of(
+            st.floats(allow_nan=False, allow_infinity=False),
+            st.integers(-(2**53), 2**53),
+            st.text(),
+            st.booleans(),
+            st.none(),
+        ),
+        lambda inner: st.one_of(st.lists(inner, max_size=4), st.dictionaries(st.text(), inner, max_size=4)),
+        max_leaves=20,
+    )
+)
+def test_json_is_read_back_as_it_was(value):
+    assert json.loads(dumps(value)) == value
+
+
+def test_numbers_have_17_digits():
+    assert dumps(0.1) == "0.10000000000000001"
+    assert dumps(np.array([[1.0, 2.5]])) == "[\n  [1.0, 2.5]\n]"

@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+
+from mtpcr_geo.benchmark.metrics import centroid_errors, rotation_error_deg
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.method.refine import constrain
+from mtpcr_geo.registration import register
+
+
+def shifted(source: Path, T: np.ndarray, out: Path) -> np.ndarray:
+    las = laspy.read(source)
+    xyz = transforms.apply(T, np.column_stack([las.x, las.y, las.z]))
+    las.change_scaling(offsets=np.floor(xyz.min(axis=0)))
+    las.x, las.y, las.z = xyz.T
+    las.write(out)
+    return xyz.mean(axis=0)
+
+
+def test_a_prior_finds_what_lies_near_it(shared_data: Path, tmp_path: Path) -> None:
+    folder = shared_data / "coast_town_sparse_ign382"
+    with laspy.open(folder / "source.laz") as file:
+        middle = (file.header.mins + file.header.maxs) / 2
+    T = transforms.translation((6.0, -4.0, 1.5)) @ transforms.about(
+        middle, transforms.yaw_matrix(np.radians(2.5))
+    )
+    centroid = shifted(folder / "source.laz", T, tmp_path / "source.laz")
+    found = register(
+        tmp_path / "source.laz", folder / "target.laz", tmp_path / "out", prior="georef", recording=False
+    )
+    assert found.verdict.name == "accepted"
+    assert found.T_target_source is not None
+    truth = transforms.inverse(T)
+    assert rotation_error_deg(found.T_target_source, truth) < 0.1
+    assert centroid_errors(found.T_target_source, truth, centroid)[0] < 0.3
+
+
+def test_a_prior_needs_both_crs(town_files: tuple[Path, Path], tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="needs a CRS on both"):
+        register(*town_files, tmp_path / "out", prior="georef", source_crs="local", recording=False)
+
+
+def test_translation_only_keeps_the_directions(town_files: tuple[Path, Path], tmp_path: Path) -> None:
+    # the town's source is turned by 61 degrees, so a pure shift cannot bring it home, and must not claim to
+    found = register(*town_files, tmp_path / "out", motion="translation", recording=False)
+    assert found.T_target_source is not None
+    assert np.allclose(found.T_target_source[:3, :3], np.eye(3), atol=1e-12)
+    assert found.verdict.name != "accepted"
+
+
+def test_constraining_keeps_the_pivot_where_it_goes() -> None:
+    R = transforms.yaw_matrix(0.4) @ transforms.tilt_matrix(1.0, 0.05)
+    T = transforms.compose(R, np.array([3.0, 4.0, 5.0]))
+    pivot = np.array([[20.0, -10.0, 2.0]])
+    yaw = constrain(T, "yaw", pivot[0], np.eye(3))
+    assert np.allclose(transforms.apply(yaw, pivot), transforms.apply(T, pivot))
+    assert yaw[2, 2] == 1.0
+    shift = constrain(T, "translation", pivot[0], np.eye(3))
+    assert np.allclose(transforms.apply(shift, pivot), transforms.apply(T, pivot))
+    assert np.array_equal(shift[:3, :3], np.eye(3))
+    assert np.array_equal(constrain(T, "rigid", pivot[0], np.eye(3)), T)

@@ -1,0 +1,178 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers_scene import houses, make_pair
+
+from mtpcr_geo.benchmark.steps import follow, level_pair
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.errors import RegistrationError
+from mtpcr_geo.core.types import Ties
+from mtpcr_geo.method.icp import FAR_REACH_M, NEAR_REACH_M, Method, Rounds, Surfaces, rounds_for
+from mtpcr_geo.method.overlap import overlap_of
+from mtpcr_geo.method.refine import follow_icp, settle_on_ground
+from mtpcr_geo.verdict.evidence import gather, ties_agreeing
+
+
+@pytest.fixture(scope="module")
+def clouds() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(11)
+    return houses(rng, 60_000), houses(rng, 60_000)
+
+
+def off_by(yaw_deg: float, shift: tuple[float, float, float]) -> np.ndarray:
+    return transforms.compose(transforms.yaw_matrix(np.radians(yaw_deg)), np.array(shift))
+
+
+def icp(source: np.ndarray, target: np.ndarray, T_start: np.ndarray, method: Method = "gicp") -> np.ndarray:
+    return Surfaces(source, target, T_start).descend(T_start, Rounds((3.0, 1.5, 0.75)), method=method).T
+
+
+@pytest.mark.parametrize(
+    ("method", "within"), [("gicp", 0.01), ("point_to_plane", 0.01), ("point_to_point", 0.06)]
+)
+def test_icp_comes_back_from_a_rough_start(clouds, method: Method, within: float) -> None:
+    source, target = clouds
+    found = icp(source, target, off_by(0.7, (0.8, -0.6, 0.4)), method)
+    corners = np.array([[50.0, 50, 0], [-50, 50, 0], [-50, -50, 0], [50, -50, 5]])
+    assert np.linalg.norm(transforms.apply(found, corners) - corners, axis=1).max() < within
+
+
+def test_icp_does_not_hang_on_its_start_or_on_round_off(clouds) -> None:
+    source, target = clouds
+    corners = np.array([[50.0, 50, 0], [-50, 50, 0], [-50, -50, 0], [50, -50, 5]])
+    plain = transforms.apply(icp(source, target, off_by(0.0, (0.0, 0.0, 0.0))), corners)
+    elsewhere = transforms.apply(icp(source, target, off_by(-0.2, (0.2, 0.1, 0.1))), corners)
+    assert np.linalg.norm(elsewhere - plain, axis=1).max() < 0.001
+    rng = np.random.default_rng(5)
+    noisy = [cloud + rng.normal(0.0, 1e-4, cloud.shape) for cloud in clouds]
+    again = transforms.apply(icp(*noisy, off_by(0.0, (1e-3, 0.0, 0.0))), corners)
+    assert np.linalg.norm(again - plain, axis=1).max() < 0.001
+
+
+def test_icp_is_the_same_at_each_run(clouds) -> None:
+    source, target = clouds
+    start = off_by(0.4, (0.5, 0.2, -0.3))
+    assert np.array_equal(icp(source, target, start), icp(source, target, start))
+
+
+def test_without_overlap_refinement_is_refused(clouds) -> None:
+    source, target = clouds
+    with pytest.raises(RegistrationError, match="overlap"):
+        icp(source, target, off_by(0.0, (300.0, 0.0, 0.0)))
+
+
+def test_ground_settles_height_and_tilt_though_roofs_differ(clouds) -> None:
+    source, target = clouds
+    raised = target.copy()
+    roofs = raised[:, 2] > 6.0
+    raised[roofs, 2] += 3.0
+    T = transforms.about(np.zeros(3), transforms.tilt_matrix(0.4, np.radians(0.5))) @ transforms.translation(
+        (0, 0, 0.8)
+    )
+    found = settle_on_ground(source, raised, T, tilt=True)
+    plain = np.array([[40.0, 40, 0], [-40, 40, 0], [-40, -40, 0], [40, -40, 0]])
+    assert np.abs((transforms.apply(found.T, plain) - plain)[:, 2]).max() < 0.12
+
+
+def test_overlap_is_what_both_fill() -> None:
+    rng = np.random.default_rng(12)
+    a = rng.uniform(0, 100, (60_000, 3)) * [1, 1, 0.01]
+    b = a + [60.0, 0.0, 0.0]
+    overlap = overlap_of(a, b)
+    assert overlap.area_m2 == pytest.approx(4000.0, rel=0.1)
+    assert overlap.select(a).mean() == pytest.approx(0.4, abs=0.05)
+
+
+def test_reaches_grow_with_coarse_cells_and_end_alike() -> None:
+    assert rounds_for(1.0) == rounds_for(2.0)
+    fine, coarse = rounds_for(2.0), rounds_for(4.0)
+    assert fine["far"].reach_m == (*FAR_REACH_M, *NEAR_REACH_M)
+    assert fine["near"].reach_m == (*NEAR_REACH_M, NEAR_REACH_M[-1])
+    for name in ("far", "near"):
+        assert coarse[name].reach_m == tuple(2 * reach for reach in fine[name].reach_m)
+
+
+def test_misfit_is_least_where_surfaces_meet_and_goes_with_the_frame(clouds) -> None:
+    source, target = clouds
+    surfaces = Surfaces(source, target, np.eye(4))
+    true = surfaces.misfit(np.eye(4))
+    assert 0.0 < true < 0.1
+    for off in (off_by(0.4, (0, 0, 0)), off_by(0.0, (0.3, -0.2, 0.0)), off_by(0.0, (0, 0, 0.15))):
+        assert surfaces.misfit(off) > true + 0.02
+    assert surfaces.misfit(off_by(0.0, (0.0, 0.0, 500.0))) == pytest.approx(1.0, abs=1e-4)
+    turn = off_by(50.0, (3000.0, -2000.0, 100.0))
+    elsewhere = Surfaces(source, transforms.apply(turn, target), turn)
+    assert elsewhere.misfit(turn) == pytest.approx(true, abs=0.01)
+
+
+def grown_fields(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rolling farmland with furrows twice; in the target a crop stands 0.7 m high on the eastern part."""
+    rng = np.random.default_rng(seed)
+
+    def scan(n: int) -> np.ndarray:
+        xy = rng.uniform(-60.0, 60.0, (n, 2))
+        rolling = 1.5 * np.sin(xy[:, 0] / 25.0) + np.cos(xy[:, 1] / 18.0)
+        furrows = 0.25 * np.sin(0.9 * xy[:, 0]) * np.sin(0.7 * xy[:, 1])
+        return np.column_stack([xy, rolling + furrows + rng.normal(0.0, 0.02, n)])
+
+    source, target = scan(50_000), scan(50_000)
+    crop = target[:, 0] > 10.0
+    target[crop, 2] += 0.7 + rng.normal(0.0, 0.1, int(crop.sum()))
+    return source, target
+
+
+def test_crops_that_lead_icp_off_the_ground_are_seen_through() -> None:
+    source, target = grown_fields(3)
+    corners = np.array([[50.0, 50, 0], [-50, 50, 0], [-50, -50, 0], [50, -50, 0]])
+
+    def off(T: np.ndarray) -> float:
+        return float(np.abs(transforms.apply(T, corners) - corners).max())
+
+    start = off_by(0.0, (0.05, -0.05, 0.02))
+    surfaces = Surfaces(source, target, start)
+    led_off = surfaces.descend(start, rounds_for(1.0)["far"]).T
+    found = follow_icp(
+        surfaces,
+        {"ties": start},
+        rounds=rounds_for(1.0),
+        agreeing=lambda T: 10,
+        keep_ties=0.5,
+    )
+    assert off(led_off) > 0.3
+    assert off(found.T) < 0.1
+    assert not found.report["followed"]
+    assert not found.report["lost_ties"]
+
+
+@pytest.mark.parametrize("keep_ties", [0.5, 0.0])
+def test_icp_that_loses_the_ties_is_followed_only_where_that_is_asked(clouds, keep_ties: float) -> None:
+    pair = level_pair(*clouds, "none")
+    aside = off_by(0.0, (2.2, -1.2, 0.0))
+    rng = np.random.default_rng(2)
+    place = rng.uniform(-40, 40, (60, 3)) * [1, 1, 0]
+    # ties that agree on a pose from which ICP goes away, to where the clouds fit
+    ties = Ties(
+        place, transforms.apply(aside, place), np.ones(60), np.arange(60) % 4, np.arange(60) % 4 == 0,
+        np.ones(60, bool),
+    )  # fmt: skip
+    pair = pair.with_(ties=ties, T_target_source=aside)
+    step = {"type": "mtpcr.refine", "tag": "refine", "keep_ties": keep_ties}
+    refined = follow(pair, [step]).pair
+    followed = keep_ties == 0.0
+    assert refined.refine_report["icp"]["followed"] is followed
+    assert refined.refine_report["icp"]["lost_ties"] is not followed
+    assert ties_agreeing(refined, refined.T_target_source) == (0 if followed else 60)
+    plan = np.linalg.norm(refined.T_target_source[:2, 3])
+    assert plan < 0.05 if followed else plan == pytest.approx(np.hypot(2.2, 1.2), abs=0.05)
+
+
+def test_way_from_the_ties_is_measured_in_plan() -> None:
+    # under a degree of tilt levelled heights are off by metres, and coming back from that is no fault
+    pair = make_pair(3000, tilt=4.0)
+    up = transforms.inverse(pair.target.T_level_work)[:3, :3] @ np.array([0.0, 0.0, 2.5])
+    raised = pair.with_(refine_report={"T_before": transforms.translation(-up) @ pair.T_target_source})
+    assert gather(raised)[0].refined_away_m < 1e-9
+    aside = transforms.inverse(pair.target.T_level_work)[:3, :3] @ np.array([1.5, -2.0, 0.0])
+    moved = pair.with_(refine_report={"T_before": transforms.translation(-aside) @ pair.T_target_source})
+    assert gather(moved)[0].refined_away_m == pytest.approx(2.5)
