@@ -5,7 +5,7 @@
 DATA holds a folder for each pair, as for benchmark_matchers.py. Every start turns the source by up to 90
 degrees and shifts it by up to 100 m, as in the paper; the clouds stand upright, so levelling takes no part.
 Steps are those of ``register --profile paper``; with ``--robust`` the SVD starts from the yaw and shift that
-most ties agree on, since one SVD over many outliers does not recover, whatever the image. With
+most tie points agree on, since one SVD over many outliers does not recover, whatever the image. With
 ``--band-pass`` enhancement means our band-passed heights in place of the paper's two filters.
 """
 
@@ -38,7 +38,9 @@ def main() -> None:
     parser.add_argument("--models", type=Path, help="folder of model files")
     parser.add_argument("--starts", type=int, default=5, help="random starts of each pair")
     parser.add_argument("--seed", type=int, default=0, help="seed of the starts")
-    parser.add_argument("--robust", action="store_true", help="start the SVD from what most ties agree on")
+    parser.add_argument(
+        "--robust", action="store_true", help="start the SVD from what most tie points agree on"
+    )
     parser.add_argument("--band-pass", action="store_true", help="band-passed heights as enhancement")
     options = parser.parse_args()
     try:

@@ -136,7 +136,7 @@ def runs(
                     "matcher": matcher, "image": look,
                     "verdict": outcome.verdict,
                     "matches": len(outcome.pair.matches.score) if outcome.pair.matches else 0,
-                    "agreeing": int(outcome.pair.ties.inlier.sum()) if T is not None else 0,
+                    "agreeing": int(outcome.pair.tie_points.inlier.sum()) if T is not None else 0,
                     "time_s": sum(outcome.seconds.values()), "match_s": outcome.seconds.get("mtpcr.match"),
                     "memory_mib": outcome.memory_mib, "right": False,
                     "why": outcome.failure or "; ".join(outcome.pair.verdict.reasons),

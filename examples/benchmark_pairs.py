@@ -32,7 +32,7 @@ from mtpcr_geo.core import transforms
 
 FIELDS = (
     "pair", "start", "verdict", "success", "rotation_deg", "plan_m", "height_m", "time_s", "memory_mb",
-    "margin", "withheld_agreeing", "withheld", "sigma_plan_m", "registered", "reasons",
+    "margin", "held_out_agreeing", "held_out", "sigma_plan_m", "registered", "reasons",
 )  # fmt: skip
 
 
@@ -160,10 +160,10 @@ def run(source: Path, target: Path, options: list[str], out: Path) -> dict[str, 
     began = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
-    told = process.stderr.read()
+    reported = process.stderr.read()
     _, _, usage = os.wait4(process.pid, 0)
     row: dict[str, Any] = {"time_s": time.perf_counter() - began, "memory_mb": usage.ru_maxrss / 1024}
-    row |= {"verdict": "error", "reasons": told.strip(), "T_target_source": None}
+    row |= {"verdict": "error", "reasons": reported.strip(), "T_target_source": None}
     if (out / "run.json").exists():
         result = json.loads((out / "run.json").read_text())
         judged = result["metrics"]
@@ -171,8 +171,8 @@ def run(source: Path, target: Path, options: list[str], out: Path) -> dict[str, 
             "verdict": result["verdict"],
             "reasons": "; ".join(result["reasons"]),
             "margin": judged.get("hypothesis_margin"),
-            "withheld": judged.get("withheld_ties"),
-            "withheld_agreeing": judged.get("withheld_agreeing"),
+            "held_out": judged.get("held_out_tie_points"),
+            "held_out_agreeing": judged.get("held_out_agreeing"),
             "sigma_plan_m": judged.get("sigma_plan_source_centroid_m"),
         }
     if (out / "transform.json").exists():
@@ -209,16 +209,16 @@ def summary(rows: list[dict[str, Any]], unrelated_runs: bool) -> str:
         return "nothing to run"
     accepted = sum(row["verdict"] == "accepted" for row in rows)
     seconds, memory = [row["time_s"] for row in rows], [row["memory_mb"] for row in rows]
-    told = [
+    reported = [
         f"\n{len(rows)} runs: {accepted} accepted; median {np.median(seconds):.2f} s, longest "
         f"{max(seconds):.2f} s; peak memory {max(memory):.0f} MiB"
     ]
     if unrelated_runs:
-        told.append(f"registered.laz written in {sum(bool(row.get('registered')) for row in rows)} runs")
-        return "\n".join(told)
+        reported.append(f"registered.laz written in {sum(bool(row.get('registered')) for row in rows)} runs")
+        return "\n".join(reported)
     right = [bool(row.get("success")) for row in rows]
     wrong = sum(row["verdict"] == "accepted" and not row.get("success") for row in rows)
-    told.append(f"right within 5 degrees and 2 m: {sum(right)}; accepted but wrong: {wrong}")
+    reported.append(f"right within 5 degrees and 2 m: {sum(right)}; accepted but wrong: {wrong}")
     head = f"\n{'pair (median / worst)':28} {'accepted':>9} {'right':>7} {'rotation deg':>15} {'plan m':>15}"
     lines = [head + f" {'height m':>15} {'s':>13} {'MiB':>6}"]
     for name in [*dict.fromkeys(row["pair"] for row in rows), None]:
@@ -229,7 +229,7 @@ def summary(rows: list[dict[str, Any]], unrelated_runs: bool) -> str:
             + "".join(f"{spread(own, key):>16}" for key in ("rotation_deg", "plan_m", "height_m"))
             + f" {spread(own, 'time_s', 2):>13} {max(r['memory_mb'] for r in own):6.0f}"
         )
-    return "\n".join([*lines, *told])
+    return "\n".join([*lines, *reported])
 
 
 def spread(rows: list[dict[str, Any]], key: str, digits: int = 3) -> str:

@@ -30,7 +30,7 @@ class Registration:
         verdict: accepted, doubtful or refused, with reasons and metrics.
         T_target_source: 4x4 on the coordinates as they stand in the files, source to target; None where
             no transform was found. It stands here even when refused: look at the verdict.
-        pair: the whole state, from levelled clouds to ties; None where not even a pair was made.
+        pair: the whole state, from levelled clouds to tie points; None where not even a pair was made.
         outputs: the files written, by what they are.
         report: what each stage noted, with its time.
 
@@ -81,7 +81,7 @@ def build_pipeline(
         _reader(source, "source"),
         *steps_of(options, inputs=["target", "source"]),
         {"type": "mtpcr.write_bev", "tag": "rasters", "filename": where["bev"]},
-        {"type": "mtpcr.write_ties", "tag": "ties", "filename": where["ties"]},
+        {"type": "mtpcr.write_tie_points", "tag": "tie_points", "filename": where["tie_points"]},
         *(
             {"type": "mtpcr.write_transform", "tag": tag, "filename": where[tag], "force": options.force}
             for tag in ("transform", "matrix", "pdal")

@@ -8,15 +8,18 @@ from pyproj import CRS
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.grid import Grid
-from mtpcr_geo.core.types import Bev, Hypothesis, Matches, Pair, Side, Ties, Verdict
+from mtpcr_geo.core.types import Bev, Hypothesis, Matches, Pair, Side, TiePoints, Verdict
 from mtpcr_geo.crs import FrameLink, WorkFrame
 
 ICP_REPORT = {
     "method": "gicp",
-    "tried": {"ground": {"misfit": 0.52, "ties": 14}, "near": {"misfit": 0.31, "ties": 15}},
+    "tried": {
+        "ground": {"surface_residual": 0.52, "tie_points": 14},
+        "near": {"surface_residual": 0.31, "tie_points": 15},
+    },
     "chosen": "near",
     "followed": True,
-    "lost_ties": False,
+    "lost_tie_points": False,
     "rounds": [
         {"reach_m": reach, "iterations": 9, "inliers": 800, "converged": True} for reach in (1.0, 0.5)
     ],
@@ -158,7 +161,7 @@ def make_pair(
     fold = np.arange(m) % 5
     if state == "tied":
         inlier = np.ones(m, bool)
-    pair = pair.with_(ties=Ties(source_xyz, target_xyz, score, fold, fold == 0, inlier))
+    pair = pair.with_(tie_points=TiePoints(source_xyz, target_xyz, score, fold, fold == 0, inlier))
     if state == "tied":
         return pair
     T_work = T @ source.T_level_work
@@ -170,16 +173,19 @@ def make_pair(
     if state == "solved":
         return pair
     reasons = {
-        "accepted": ("16 withheld ties agree to 0.11 m", "the best pose scores 2.3 times the next"),
+        "accepted": ("16 held-out tie points agree to 0.11 m", "the best pose scores 2.3 times the next"),
         "doubtful": ("the best pose scores only 1.05 times the next",),
-        "refused": ("only 3 of 16 withheld ties agree within 1 m", "the clouds share 2 % of their cells"),
+        "refused": (
+            "only 3 of 16 held-out tie points agree within 1 m",
+            "the clouds share 2 % of their cells",
+        ),
     }[verdict]
     metrics = {
         "overlap_share": 0.83,
         "hypothesis_margin": 2.30,
-        "withheld_ties": 16,
-        "withheld_inlier_share": 0.81,
-        "withheld_residual_median_m": 0.11,
+        "held_out_tie_points": 16,
+        "held_out_inlier_share": 0.81,
+        "held_out_residual_median_m": 0.11,
         "sigma_plan_m": 0.04,
         "sigma_height_m": 0.03,
         "sigma_yaw_deg": 0.02,

@@ -42,25 +42,25 @@ def pairs(town_files: tuple[Path, Path], tmp_path: Path) -> Path:
 
 
 def test_benchmark_pairs(pairs: Path, tmp_path: Path) -> None:
-    told = run("benchmark_pairs.py", pairs, "--starts", 1, "--csv", tmp_path / "runs.csv")
-    assert "2 runs: 2 accepted" in told
-    assert "accepted but wrong: 0" in told
+    reported = run("benchmark_pairs.py", pairs, "--starts", 1, "--csv", tmp_path / "runs.csv")
+    assert "2 runs: 2 accepted" in reported
+    assert "accepted but wrong: 0" in reported
     assert len((tmp_path / "runs.csv").read_text().splitlines()) == 3
 
 
 def test_benchmark_matchers(pairs: Path, tmp_path: Path) -> None:
     words = ("--starts", 1, "--matchers", "correlation", "rootsift", "--images", "band_pass", "--only", "a")
-    told = run("benchmark_matchers.py", pairs, *words, "--csv", tmp_path / "runs.csv")
-    assert "accepted but wrong                           0           0" in told
+    reported = run("benchmark_matchers.py", pairs, *words, "--csv", tmp_path / "runs.csv")
+    assert "accepted but wrong                           0           0" in reported
     assert len((tmp_path / "runs.csv").read_text().splitlines()) == 3
 
 
 def test_ablation(pairs: Path) -> None:
-    told = run("ablation.py", pairs, "--only", "a", "--starts", 1, "--robust")
-    assert told.count("/1 ") == 8
+    reported = run("ablation.py", pairs, "--only", "a", "--starts", 1, "--robust")
+    assert reported.count("/1 ") == 8
 
 
 def test_simulate_pairs(tmp_path: Path) -> None:
-    told = run("simulate_pairs.py", tmp_path, "--first", 1)
-    assert "town_1" in told
+    reported = run("simulate_pairs.py", tmp_path, "--first", 1)
+    assert "town_1" in reported
     assert (tmp_path / "town_1" / "pair.json").exists()

@@ -64,7 +64,7 @@ class Trajectory:
 
 
 def combinations() -> tuple[Combination, ...]:
-    """Give the paper's fourteen combinations."""
+    """Return the paper's fourteen combinations."""
     return COMBINATIONS
 
 

@@ -18,7 +18,7 @@ def reset_peak() -> None:
 
 
 def peak_mib() -> float | None:
-    """Give the most resident memory since the last reset, in MiB: libraries and inputs included.
+    """Return the most resident memory since the last reset, in MiB: libraries and inputs included.
 
     Where it cannot be reset it is the process's peak so far; None where the system tells nothing.
     """
@@ -37,7 +37,7 @@ def peak_mib() -> float | None:
 
 
 def tree_mib(pid: int) -> float | None:
-    """Give the resident memory of a process and all that descend from it, now, in MiB.
+    """Return the resident memory of a process and all that descend from it, now, in MiB.
 
     None where the system does not tell (it is read from ``/proc``).
     """

@@ -41,17 +41,17 @@ class PoseErrors:
     rms_m: float
 
     def within(self, rotation_deg: float = 5.0, translation_m: float = 2.0) -> bool:
-        """Say whether the run counts as a success: e_r and e_t below the thresholds (the paper's SRR)."""
+        """Return whether the run counts as a success: e_r and e_t below the thresholds (the paper's SRR)."""
         return self.rotation_deg < rotation_deg and self.translation_m < translation_m
 
 
 def rotation_error_deg(T: Floats, T_true: Floats) -> float:
-    """Give e_r in degrees: ``arccos((trace(dR) - 1) / 2)``, by a form exact for tiny angles."""
+    """Return e_r in degrees: ``arccos((trace(dR) - 1) / 2)``, by a form exact for tiny angles."""
     return float(np.rad2deg(transforms.rotation_angle(T[:3, :3] @ T_true[:3, :3].T)))
 
 
 def translation_error(T: Floats, T_true: Floats, target_centre: Floats) -> float:
-    """Give e_t in metres: ``||dt||`` of ``dT = T inverse(T_true)`` in a frame centred on the target.
+    """Return e_t in metres: ``||dt||`` of ``dT = T inverse(T_true)`` in a frame centred on the target.
 
     Args:
         T: 4x4 result.
@@ -66,7 +66,7 @@ def translation_error(T: Floats, T_true: Floats, target_centre: Floats) -> float
 
 
 def centroid_errors(T: Floats, T_true: Floats, source_centroid: Floats) -> tuple[float, float]:
-    """Give the errors of the source's centroid: distance in plan, and signed height, in metres.
+    """Return the errors of the source's centroid: distance in plan, and signed height, in metres.
 
     Args:
         T: 4x4 result.
@@ -79,7 +79,7 @@ def centroid_errors(T: Floats, T_true: Floats, source_centroid: Floats) -> tuple
 
 
 def rmsd(T: Floats, T_true: Floats, source: Floats) -> float:
-    """Give the paper's RMSD in metres: the mean distance between the source moved by T and by T_true.
+    """Return the paper's RMSD in metres: the mean distance between the source moved by T and by T_true.
 
     The paper names it a root mean square and defines it as a mean; this is the definition. The root
     mean square is `rms`.
@@ -94,7 +94,7 @@ def rmsd(T: Floats, T_true: Floats, source: Floats) -> float:
 
 
 def rms(T: Floats, T_true: Floats, source: Floats) -> float:
-    """Give the root mean square distance in metres between the source moved by T and by T_true.
+    """Return the root mean square distance in metres between the source moved by T and by T_true.
 
     Args:
         T: 4x4 result.
@@ -127,7 +127,7 @@ def pose_errors(T: Floats, T_true: Floats, source: Floats, target_centre: Floats
 
 
 def overlap_ratios(source_in_target: Floats, target: Floats, cell: float = 1.0) -> tuple[float, float]:
-    """Give the share of each cloud's occupied cells that have an occupied cell of the other near them.
+    """Return the share of each cloud's occupied cells that have an occupied cell of the other near them.
 
     Seen from above; near is the cell itself or one of its eight neighbours, so at most about 1.4 cells
     (centre to centre). Both clouds in one frame.
@@ -148,7 +148,7 @@ def overlap_ratios(source_in_target: Floats, target: Floats, cell: float = 1.0) 
 
 
 def _steps(T: Floats, T_true: Floats, source: Floats) -> Floats:
-    """Give (n, 3) metres from where each source point should be to where it was placed.
+    """Return (n, 3) metres from where each source point should be to where it was placed.
 
     The difference of the matrices acts about the source's centroid, so that far coordinates cancel
     before they are multiplied.

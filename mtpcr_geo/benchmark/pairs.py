@@ -29,7 +29,7 @@ class BenchmarkPair:
     Attributes:
         name: the folder's.
         group: which group of the tables it belongs to, such as "A-G"; "pairs" where none is said.
-        source: (n, 3) where it truly lies, noise and withheld points left out.
+        source: (n, 3) where it truly lies, noise and held out points left out.
         target: (m, 3), likewise.
         origin: (3,) the frame's origin in the target's file coordinates, whole metres.
         overlap_cell_m: edge of the cells in which overlap is measured, metres.
@@ -88,7 +88,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
 
 
 def true_transform(facts: dict[str, Any]) -> Floats:
-    """Give the 4x4 truth in file coordinates, with a measured vertical offset between epochs put in."""
+    """Return the 4x4 truth in file coordinates, with a measured vertical offset between epochs put in."""
     truth = facts["ground_truth"]
     T = np.array(truth["T_target_from_source"], np.float64).reshape(4, 4)
     T[2, 3] += truth.get("measured_vertical_offset", {}).get("dz_target_minus_source_m", 0.0)

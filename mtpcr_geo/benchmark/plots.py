@@ -20,7 +20,7 @@ DASHES: tuple[str, ...] = ("-", "--", "-.", ":")
 
 
 def cumulative(errors: Sequence[float], runs: int) -> tuple[Floats, Floats]:
-    """Give the steps of a cumulative curve: errors in rising order, and the percentage of runs up to each.
+    """Return the steps of a cumulative curve: errors in rising order, and the percentage of runs up to each.
 
     Args:
         errors: of the runs with an answer.
@@ -32,7 +32,7 @@ def cumulative(errors: Sequence[float], runs: int) -> tuple[Floats, Floats]:
 
 
 def binned(values: Sequence[float], right: Sequence[bool], edges: Sequence[float]) -> list[dict[str, float]]:
-    """Give the success rate in each bin that holds runs: its middle, percentage, and number of runs.
+    """Return the success rate in each bin that holds runs: its middle, percentage, and number of runs.
 
     Args:
         values: what to sort runs by.
@@ -139,7 +139,7 @@ def _rate_name() -> str:
 
 
 def _short(method: str) -> str:
-    """Give an external method by its file's name, "external:file=there/codem.json" as "codem"."""
+    """Return an external method by its file's name, "external:file=there/codem.json" as "codem"."""
     file = options_of(method).get("file")
     return method if file is None else Path(str(file)).stem
 

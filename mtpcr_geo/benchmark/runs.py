@@ -61,7 +61,7 @@ class Wanted:
     overlaps: tuple[float, ...] = (0.18,)
 
     def folders(self, cache: Path, progress: Progress | None = None) -> list[Path]:
-        """Give the pairs' folders, made in `cache` where they must be made.
+        """Return the pairs' folders, made in `cache` where they must be made.
 
         Raises:
             OptionError: if nothing is asked for.
@@ -161,7 +161,7 @@ def write_results(rows: Sequence[Row], out: Path, extents: Mapping[str, Sequence
 
 
 def shown(rows: Sequence[Row]) -> str:
-    """Give the sums of each method as a Markdown table."""
+    """Return the sums of each method as a Markdown table."""
     return tables.to_markdown([{key: line[key] for key in _SHOWN} for line in tables.by_method(rows)])
 
 
@@ -179,7 +179,7 @@ def numbers_of(text: str) -> tuple[float, ...]:
 
 
 def extents_of(folders: Sequence[Path]) -> dict[str, list[float]]:
-    """Give the extents that pairs' descriptions tell: metres in x, y, z, by name."""
+    """Return the extents that pairs' descriptions tell: metres in x, y, z, by name."""
     out = {}
     for folder in folders:
         facts = read_facts(folder)
@@ -211,7 +211,7 @@ def _report(rows: Sequence[Row], made: Mapping[str, list[dict[str, Any]]]) -> st
 
 
 def _flat(row: Row) -> dict[str, Any]:
-    """Give a run as one line: success in words of its own, without the matrix and the details."""
+    """Return a run as one line: success in words of its own, without the matrix and the details."""
     line = {key: value for key, value in row.items() if key not in ("T_target_source", "details")}
     line |= {tables.label(limits): tables.success(row, limits) for limits in tables.THRESHOLDS}
     return line | {"false_accept": tables.false_accept(row)}

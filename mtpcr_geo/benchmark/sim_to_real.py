@@ -78,7 +78,7 @@ def cloud_figures(xyz: Floats, cell: float = 1.0) -> dict[str, float]:
 
 
 def spread(clouds: Sequence[Mapping[str, float]]) -> dict[str, tuple[float, float, float]]:
-    """Give the least, median and greatest of each figure over several clouds."""
+    """Return the least, median and greatest of each figure over several clouds."""
     return {
         name: (
             min(c[name] for c in clouds),

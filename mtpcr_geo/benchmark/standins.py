@@ -167,7 +167,7 @@ def simulate_stand_in(stand_in: StandIn, *, density: float = 1.0) -> SimulatedPa
 
 
 def _typical(group: str) -> Scene:
-    """Give the mean of the group's rows in Table I."""
+    """Return the mean of the group's rows in Table I."""
     rows = [
         scene for name, scene in TABLE_I.items() if "-".join(part[0] for part in name.split("-")) == group
     ]

@@ -59,7 +59,7 @@ def level_pair(source: Floats, target: Floats, level: str, seed: int = 0) -> Pai
 
 
 def steps_of(**options: Any) -> list[dict[str, Any]]:
-    """Give the steps from mtpcr.bev to mtpcr.assess that `register` takes with these options."""
+    """Return the steps from mtpcr.bev to mtpcr.assess that `register` takes with these options."""
     stages = build_pipeline("source.laz", "target.laz", "out", read_options(options))
     names = [stage["type"] for stage in stages]
     return stages[names.index("mtpcr.bev") : names.index("mtpcr.assess") + 1]

@@ -41,17 +41,17 @@ FRAME_NOTE = (
 
 
 def answered(row: Row) -> bool:
-    """Say whether a run gave a transform that its method stands by."""
+    """Return whether a run gave a transform that its method stands by."""
     return "rotation_deg" in row and row["verdict"] != "refused"
 
 
 def success(row: Row, thresholds: tuple[float, float] = LENIENT) -> bool:
-    """Say whether a run is a success: degrees and metres below the thresholds, and not refused."""
+    """Return whether a run is a success: degrees and metres below the thresholds, and not refused."""
     return answered(row) and row["rotation_deg"] < thresholds[0] and row["translation_m"] < thresholds[1]
 
 
 def false_accept(row: Row) -> bool:
-    """Say whether a method accepted a wrong answer."""
+    """Return whether a method accepted a wrong answer."""
     return bool(row["verdict"] == "accepted" and not success(row))
 
 

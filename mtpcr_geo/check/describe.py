@@ -9,12 +9,12 @@ import numpy as np
 from mtpcr_geo.check.place import code_of, epochs_of
 
 if TYPE_CHECKING:
-    from mtpcr_geo.check.preflight import Looked
+    from mtpcr_geo.check.preflight import Inspection
     from mtpcr_geo.crs import CrsFacts
     from mtpcr_geo.io.las import LasCloud
 
 
-def describe(looked: Looked) -> dict[str, Any]:
+def describe(looked: Inspection) -> dict[str, Any]:
     """Gather what is known of a cloud, for the table and for JSON; None stands for what is not known."""
     cloud, facts, scan = looked.cloud, looked.claim.facts, looked.scan
     epoch, frame_epoch = epochs_of(cloud, facts)

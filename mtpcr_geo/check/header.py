@@ -47,7 +47,7 @@ class RawHeader:
 
     @property
     def says_wkt(self) -> bool:
-        """Whether the WKT bit of the global encoding is set."""
+        """Return whether the WKT bit of the global encoding is set."""
         return bool(self.encoding & _WKT_BIT)
 
 
@@ -191,7 +191,7 @@ def _counts(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Finding]:
 
 
 def scales_in_metres(scales: NDArray[np.float64], facts: CrsFacts) -> NDArray[np.float64]:
-    """Give the size of a file's last digits in metres, (3,)."""
+    """Return the size of a file's last digits in metres, (3,)."""
     plan = facts.unit * (METRES_A_DEGREE if facts.kind == "geographic" else 1.0)
     return np.asarray(scales, np.float64) * [plan, plan, facts.height_unit]
 

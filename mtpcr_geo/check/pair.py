@@ -14,7 +14,7 @@ from mtpcr_geo.check.place import EXCHANGE, area_findings, exchanged, within_are
 from mtpcr_geo.crs.resolve import FARTHEST_APART
 
 if TYPE_CHECKING:
-    from mtpcr_geo.check.preflight import Looked
+    from mtpcr_geo.check.preflight import Inspection
     from mtpcr_geo.crs import FrameLink
     from mtpcr_geo.method.overlap import Overlap
 
@@ -51,7 +51,7 @@ class Relation:
 
 
 def relate(source: Floats, target: Floats) -> tuple[Relation, Overlap | None]:
-    """Tell how two clouds lie to each other.
+    """Return how two clouds lie to each other.
 
     Args:
         source, target: (n, 3) and (m, 3) samples in one frame, metres.
@@ -85,8 +85,8 @@ def relate(source: Floats, target: Floats) -> tuple[Relation, Overlap | None]:
     return Relation("apart", float(distance.min()), 0.0, 0.0, 0.0), overlap
 
 
-def by_area(source: Looked, target: Looked) -> Relation:
-    """Tell roughly how far apart two clouds are that came to no common frame, from their middles."""
+def by_area(source: Inspection, target: Inspection) -> Relation:
+    """Return roughly how far apart two clouds are that came to no common frame, from their middles."""
     from pyproj import Geod
 
     from mtpcr_geo.core.frames import box_points
@@ -122,7 +122,7 @@ def _area(xyz: Floats, cell: float) -> float:
 
 
 def relation_findings(relation: Relation) -> Iterator[Finding]:
-    """Say whether the clouds lie where they can be registered."""
+    """Return whether the clouds lie where they can be registered."""
     if relation.name == "apart" and relation.distance_m:
         yield Finding(
             "warning",
@@ -202,7 +202,7 @@ def height_pair_findings(overlap: Overlap, height: float) -> Iterator[Finding]:
 
 
 def in_feet(source: Floats, target: Floats) -> tuple[float, Literal["source", "target"]] | None:
-    """Tell whether one of two sets of heights of the same ground is in feet, the other in metres.
+    """Return whether one of two sets of heights of the same ground is in feet, the other in metres.
 
     Both how high they lie and how much they vary must differ by the factor, so that neither a shift of
     the datum nor trees in one of them can look like it.
@@ -243,7 +243,7 @@ def link_findings(source: FrameLink, target: FrameLink) -> Iterator[Finding]:
             yield Finding("note", "vertical-taken", "both", note)
 
 
-def swapped_findings(source: Looked, target: Looked) -> Iterator[Finding]:
+def swapped_findings(source: Inspection, target: Inspection) -> Iterator[Finding]:
     """Find x and y exchanged in one cloud against the other: apart as they stand, together if exchanged."""
     if source.claim.facts is None or target.claim.facts is None:
         return
@@ -267,8 +267,8 @@ def swapped_findings(source: Looked, target: Looked) -> Iterator[Finding]:
             return
 
 
-def _meet(source: Looked, target: Looked, turned: tuple[str, ...]) -> bool:
-    """Tell whether the bounds of two clouds come near each other, x and y exchanged in those named."""
+def _meet(source: Inspection, target: Inspection, turned: tuple[str, ...]) -> bool:
+    """Return whether the bounds of two clouds come near each other, x and y exchanged in those named."""
     from mtpcr_geo.core.cloud import ArrayCloud
     from mtpcr_geo.core.errors import MtpcrError
     from mtpcr_geo.crs import resolve_frames
@@ -296,7 +296,7 @@ def _meet(source: Looked, target: Looked, turned: tuple[str, ...]) -> bool:
     return bool((np.maximum(low[0] - high[1], low[1] - high[0]) <= near).all())
 
 
-def same_points_findings(source: Looked, target: Looked) -> Iterator[Finding]:
+def same_points_findings(source: Inspection, target: Inspection) -> Iterator[Finding]:
     """Find points that stand in both clouds, coordinate by coordinate: a cloud fits itself perfectly."""
     if source.scan is None or target.scan is None:
         return
@@ -325,7 +325,7 @@ def same_points_findings(source: Looked, target: Looked) -> Iterator[Finding]:
 
 
 def _keys(xyz: Floats, step: float) -> NDArray[np.uint64]:
-    """Give one number a place, the same for the same place, (n,)."""
+    """Return one number a place, the same for the same place, (n,)."""
     steps = np.rint(xyz / step).astype(np.int64).view(np.uint64)
     # odd numbers without pattern: products wrap around, and places do not fall together
     odd = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)

@@ -98,7 +98,7 @@ def epochs_of(cloud: LasCloud, facts: CrsFacts | None) -> tuple[float | None, fl
 def claim_findings(
     cloud: LasCloud, claim: Claim, said: str | None, local: bool, role: Role, one: bool
 ) -> Iterator[Finding]:
-    """Say whether the CRS is known, by whom, and what it leaves open.
+    """Return whether the CRS is known, by whom, and what it leaves open.
 
     Args:
         cloud: the file.
@@ -203,12 +203,12 @@ def area_findings(facts: CrsFacts, bounds: Floats, role: Role) -> Iterator[Findi
 
 
 def exchanged(bounds: Floats) -> Floats:
-    """Give bounds with x and y exchanged."""
+    """Return bounds with x and y exchanged."""
     return np.asarray(bounds)[:, [1, 0, 2]]
 
 
 def within_area(facts: CrsFacts, bounds: Floats, beyond: float = BEYOND_AREA_DEG) -> bool | None:
-    """Tell whether the middle of some bounds lies in a CRS's area of use, or little beyond.
+    """Return whether the middle of some bounds lies in a CRS's area of use, or little beyond.
 
     Args:
         facts: the CRS.

@@ -119,7 +119,7 @@ def noise_findings(scan: Scan, role: Role) -> Iterator[Finding]:
 
 
 def density_findings(measured: Measured, count: int, role: Role) -> Iterator[Finding]:
-    """Say whether there are enough points to see shapes by."""
+    """Return whether there are enough points to see shapes by."""
     if measured.per_m2 < SPARSE_PER_M2:
         very = measured.per_m2 < VERY_SPARSE_PER_M2
         yield Finding(

@@ -31,7 +31,7 @@ Frames = tuple[WorkFrame, FrameLink, FrameLink]
 
 
 @dataclass
-class Looked:
+class Inspection:
     """One cloud, as far as it could be looked at.
 
     Attributes:
@@ -78,12 +78,12 @@ class CheckReport:
 
     @property
     def goes_on(self) -> bool:
-        """Whether `register` would go on."""
+        """Return whether `register` would go on."""
         return self.exit_code == 0
 
 
 def _frames(
-    source: Looked, target: Looked, said: dict[CloudRole, str | None], local: bool, vertical: Vertical
+    source: Inspection, target: Inspection, said: dict[CloudRole, str | None], local: bool, vertical: Vertical
 ) -> Frames:
     return resolve_frames(
         target.cloud,
@@ -95,7 +95,7 @@ def _frames(
     )
 
 
-def _is_local(looked: Looked) -> bool:
+def _is_local(looked: Inspection) -> bool:
     return looked.claim.facts is not None and looked.claim.facts.kind == "local"
 
 
@@ -138,7 +138,7 @@ def check_clouds(
     for role, path, text in files:
         with check.stopping("input", role):
             cloud = open_cloud(path)
-            check.looked[role] = Looked(role, cloud, place.claim_of(cloud, text, local))
+            check.looked[role] = Inspection(role, cloud, place.claim_of(cloud, text, local))
     if target is not None and len(check.looked) == 2:
         with check.stopping("same-cloud", "both"):
             check_distinct(check.looked["target"].cloud, check.looked["source"].cloud)
@@ -156,7 +156,7 @@ class _Check:
     """A check on its way: what was looked at, found and refused so far."""
 
     def __init__(self) -> None:
-        self.looked: dict[CloudRole, Looked] = {}
+        self.looked: dict[CloudRole, Inspection] = {}
         self.findings: list[Finding] = []
         self.refusals: list[MtpcrError] = []
         self.relation: pair.Relation | None = None
@@ -178,7 +178,7 @@ class _Check:
             self.findings.append(finding)
 
     def look(
-        self, looked: Looked, said: str | None, local: bool, one: bool, progress: Progress | None
+        self, looked: Inspection, said: str | None, local: bool, one: bool, progress: Progress | None
     ) -> None:
         """Look at one cloud by itself."""
         cloud, claim, role = looked.cloud, looked.claim, looked.role
@@ -213,7 +213,7 @@ class _Check:
             stated = claim.facts.kind != "local"
             found += points.height_findings(looked.measured, claim.facts.height_unit_name, stated, role)
 
-    def _scan(self, looked: Looked, progress: Progress | None) -> Scan | None:
+    def _scan(self, looked: Inspection, progress: Progress | None) -> Scan | None:
         watched = points.Watched(looked.cloud)
         try:
             found = scan(watched, progress=progress)
@@ -250,7 +250,7 @@ class _Check:
             self.findings += pair.swapped_findings(source, target)
         self.findings += pair.same_points_findings(source, target)
 
-    def _relate(self, frames: Frames, source: Looked, target: Looked) -> None:
+    def _relate(self, frames: Frames, source: Inspection, target: Inspection) -> None:
         frame, to_target, to_source = frames
         if source.scan is None or target.scan is None:
             self.relation = pair.Relation("unknown", why="a cloud cannot be read")

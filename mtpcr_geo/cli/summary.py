@@ -21,8 +21,8 @@ _SHOWN = (
     "overlap_m2",
     "overlap_source",
     "overlap_target",
-    "withheld_agreeing_share",
-    "withheld_median_m",
+    "held_out_agreeing_share",
+    "held_out_median_m",
     "hypothesis_margin",
     "sigma_yaw_deg",
     "sigma_plan_source_centroid_m",
@@ -32,7 +32,7 @@ _OPEN_WITH = {
     "registered": "the moved cloud",
     "report": "the report, in any browser",
     "recording": "the recording, with: rerun",
-    "ties": "ties and footprints, in QGIS",
+    "tie_points": "tie points and footprints, in QGIS",
     "run": "everything as numbers",
 }
 

@@ -180,6 +180,6 @@ def fit_affine(move: Callable[[Floats], Floats], bounds: Floats, steps: int = 5)
 
 
 def box_points(bounds: Floats, steps: int = 5) -> Floats:
-    """Give a grid of points over a box, (steps**3, 3), its corners among them."""
+    """Return a grid of points over a box, (steps**3, 3), its corners among them."""
     axes = [np.linspace(low, high, steps) for low, high in np.asarray(bounds).T]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from math import exp, lgamma, log, log1p, pi
 
-MOST_DIGITS = 300.0
+MAX_NEG_LOG10_P = 300.0
 
 
-def surprise(agreeing: int, tried: int, chance: float) -> float:
+def neg_log10_p(agreeing: int, tried: int, chance: float) -> float:
     """Digits of improbability: -log10 of the probability that chance makes so many or more agree.
 
     Args:
@@ -19,7 +19,7 @@ def surprise(agreeing: int, tried: int, chance: float) -> float:
     if agreeing <= 0:
         return 0.0
     if chance <= 0.0:
-        return MOST_DIGITS
+        return MAX_NEG_LOG10_P
     # the binomial tail, summed in logarithms: its terms span hundreds of digits
     terms = [
         lgamma(tried + 1)
@@ -31,7 +31,7 @@ def surprise(agreeing: int, tried: int, chance: float) -> float:
     ]
     largest = max(terms)
     tail = largest + log(sum(exp(term - largest) for term in terms))
-    return min(max(-tail / log(10.0), 0.0), MOST_DIGITS)
+    return min(max(-tail / log(10.0), 0.0), MAX_NEG_LOG10_P)
 
 
 def chance_within(tolerance: float, reach: float) -> float:

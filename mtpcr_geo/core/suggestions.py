@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 def nearest(word: str, valid: Iterable[str]) -> str | None:
-    """Give the valid word most like `word`, or None if nothing is near.
+    """Return the valid word most like `word`, or None if nothing is near.
 
     A word that begins or ends another counts as near: "las" for "readers.las".
     """
@@ -25,7 +25,7 @@ def nearest(word: str, valid: Iterable[str]) -> str | None:
 
 
 def meant(word: str, valid: Iterable[str], *, turned: bool = False) -> str:
-    """Give "; did you mean 'x'?", or a list of what is valid, or nothing if there is nothing to offer.
+    """Return "; did you mean 'x'?", or a list of what is valid, or nothing if there is nothing to offer.
 
     Args:
         word: what was written.

@@ -15,7 +15,7 @@ _LIBRARIES = (
 
 
 def versions() -> dict[str, str]:
-    """Give the version of this package, of Python and of the libraries that are installed."""
+    """Return the version of this package, of Python and of the libraries that are installed."""
     found = {"mtpcr_geo": mtpcr_geo.__version__, "python": platform.python_version()}
     for name in _LIBRARIES:
         try:
@@ -26,7 +26,7 @@ def versions() -> dict[str, str]:
 
 
 def peak_memory_mb() -> float | None:
-    """Give the largest memory this process has held so far, in MiB; None where the system does not say."""
+    """Return the largest memory this process has held so far, in MiB; None where the system does not say."""
     try:
         import resource
     except ImportError:  # Windows

@@ -87,7 +87,7 @@ def orthonormal(R: Matrix) -> Matrix:
 
 
 def bounds(xyz: Points) -> tuple[Points, Points]:
-    """Give the least and greatest coordinates of (n, k) points, each (k,).
+    """Return the least and greatest coordinates of (n, k) points, each (k,).
 
     Column by column, which for long thin arrays is many times faster than along the first axis.
     """

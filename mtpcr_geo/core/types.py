@@ -131,15 +131,15 @@ class Matches:
 
 
 @dataclass(frozen=True)
-class Ties:
+class TiePoints:
     """Matches lifted to 3D, in levelled work coordinates, metres.
 
     Attributes:
         source, target: (n, 3) float64.
         score: (n,) in 0..1.
-        fold: (n,) which of the folds a tie is in, for cross-validation.
-        withheld: (n,) bool, True for ties kept from the solve to judge it: the first fold.
-        inlier: (n,) bool, True for ties that agree with the solved transform.
+        fold: (n,) which of the folds a tie point is in, for cross-validation.
+        held_out: (n,) bool, True for tie points kept from the solve to judge it: the first fold.
+        inlier: (n,) bool, True for tie points that agree with the solved transform.
 
     """
 
@@ -147,7 +147,7 @@ class Ties:
     target: Floats
     score: Floats
     fold: NDArray[np.int64]
-    withheld: NDArray[np.bool_]
+    held_out: NDArray[np.bool_]
     inlier: NDArray[np.bool_]
 
 
@@ -174,7 +174,7 @@ class Pair:
     Attributes:
         target, source: the two clouds.
         frame: the work frame (target's).
-        matches, ties: what links them, once found.
+        matches, tie_points: what links them, once found.
         T_target_source: 4x4 in work coordinates (source work -> target work), once solved.
         solve_report, refine_report: how it came about, for the audit.
         T_prior: 4x4 in work coordinates that was known beforehand, where a prior was asked for.
@@ -186,7 +186,7 @@ class Pair:
     source: Side
     frame: WorkFrame
     matches: Matches | None = None
-    ties: Ties | None = None
+    tie_points: TiePoints | None = None
     T_target_source: Floats | None = None
     solve_report: dict[str, Any] = field(default_factory=dict)
     refine_report: dict[str, Any] = field(default_factory=dict)

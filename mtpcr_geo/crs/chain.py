@@ -90,7 +90,7 @@ class TransformChain:
 
     @property
     def is_affine(self) -> bool:
-        """Whether one 4x4 on file coordinates says the same as the chain."""
+        """Return whether one 4x4 on file coordinates says the same as the chain."""
         return self.source.pipeline is None and self.target.pipeline is None
 
     @property

@@ -119,12 +119,12 @@ def facts_of(crs: CRS | None) -> CrsFacts:
 
 
 def unbound(crs: CRS) -> CRS:
-    """Give the CRS without the shift to another datum that a bound one carries."""
+    """Return the CRS without the shift to another datum that a bound one carries."""
     return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
 
 
 def metric(crs: CRS) -> CRS:
-    """Give the same projected or vertical CRS in metres; itself if it is. A bound one stays bound."""
+    """Return the same projected or vertical CRS in metres; itself if it is. A bound one stays bound."""
     from pyproj import CRS
     from pyproj.crs import BoundCRS
 
@@ -143,7 +143,7 @@ def metric(crs: CRS) -> CRS:
 
 
 def same_place(one: CRS, other: CRS) -> bool:
-    """Tell whether the same coordinates mean the same place in two CRSs, however their WKT is written."""
+    """Return whether the same coordinates mean the same place in two CRSs, however their WKT is written."""
     if one.equals(other, ignore_axis_order=True):
         return True
     code = one.to_epsg()
@@ -156,7 +156,7 @@ def same_place(one: CRS, other: CRS) -> bool:
 
 
 def same_heights(one: CrsFacts, other: CrsFacts) -> bool:
-    """Tell whether two CRSs count heights from the same surface, whatever their units."""
+    """Return whether two CRSs count heights from the same surface, whatever their units."""
     if one.height != other.height:
         return False
     if one.vertical is None or other.vertical is None:
@@ -165,7 +165,7 @@ def same_heights(one: CrsFacts, other: CrsFacts) -> bool:
 
 
 def same_datum(one: CrsFacts, other: CrsFacts) -> bool:
-    """Tell whether two CRSs rest on the same geodetic datum."""
+    """Return whether two CRSs rest on the same geodetic datum."""
     if one.horizontal is None or other.horizontal is None:
         return False
     return _datum(one.horizontal) == _datum(other.horizontal)

@@ -119,7 +119,7 @@ def area_of(facts: CrsFacts, points: Floats) -> AreaOfInterest | None:
 
 
 def grid_scale(crs: CRS, area: AreaOfInterest) -> tuple[float, float] | None:
-    """Give how long a metre of a projected CRS is drawn in the middle of an area, at least and at most.
+    """Return how long a metre of a projected CRS is drawn in the middle of an area, at least and at most.
 
     None where PROJ cannot tell.
     """
@@ -137,7 +137,7 @@ def grid_scale(crs: CRS, area: AreaOfInterest) -> tuple[float, float] | None:
 
 
 def geographic_of(crs: CRS) -> CRS:
-    """Give the geographic CRS, two axes, on which a geodetic or projected one rests."""
+    """Return the geographic CRS, two axes, on which a geodetic or projected one rests."""
     from pyproj.crs import GeographicCRS
 
     base = crs.geodetic_crs

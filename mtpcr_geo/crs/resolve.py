@@ -166,7 +166,7 @@ def _link(
 
 
 def _ends(facts: CrsFacts, work: CRS, heights: CrsFacts, agree: bool) -> tuple[CRS, CRS, bool]:
-    """Give the two CRSs between which PROJ works, and whether heights go through it too."""
+    """Return the two CRSs between which PROJ works, and whether heights go through it too."""
     from pyproj.crs import CompoundCRS
 
     if facts.crs is None or facts.horizontal is None:
@@ -181,7 +181,7 @@ def _ends(facts: CrsFacts, work: CRS, heights: CrsFacts, agree: bool) -> tuple[C
 
 
 def _heights_agree(facts: CrsFacts, other: CrsFacts, vertical: Vertical, notes: list[str]) -> bool:
-    """Tell whether heights can be taken over as they are; note why, or refuse.
+    """Return whether heights can be taken over as they are; note why, or refuse.
 
     Raises:
         CrsError: if the datums differ in a way that no operation can settle.

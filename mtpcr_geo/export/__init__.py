@@ -1,1 +1,1 @@
-"""What a run leaves behind: rasters, transform files, ties, report."""
+"""What a run leaves behind: rasters, transform files, tie points, report."""

@@ -41,7 +41,7 @@ def bars(values: Sequence[float], labels: Sequence[str], notes: Sequence[str] = 
 
 
 def histogram(residual_m: Floats, inlier: NDArray[np.bool_], limit_m: float, bins: int = 32) -> str:
-    """Draw how many ties have which misfit: agreeing ones green, the others red, stacked.
+    """Draw how many tie points have which residual: agreeing ones green, the others red, stacked.
 
     Args:
         residual_m: (n,) misfits in metres.
@@ -64,7 +64,8 @@ def histogram(residual_m: Floats, inlier: NDArray[np.bool_], limit_m: float, bin
             if number:
                 parts.append(
                     f'<rect x="{left + i * step + 1:.1f}" y="{y:.1f}" width="{step - 2:.1f}" '
-                    f'height="{size:.1f}" fill="{_css(colour)}"><title>{int(number)} ties</title></rect>'
+                    f'height="{size:.1f}" fill="{_css(colour)}">'
+                    f"<title>{int(number)} tie points</title></rect>"
                 )
     parts.append(f'<line x1="{left}" y1="{base}" x2="{_WIDTH - 10}" y2="{base}" stroke="currentColor"/>')
     parts.append(f'<text x="{left - 6}" y="20" text-anchor="end">{top}</text>')
@@ -77,10 +78,10 @@ def histogram(residual_m: Floats, inlier: NDArray[np.bool_], limit_m: float, bin
     return _svg(_WIDTH, height, parts)
 
 
-def misfit_map(
+def residual_map(
     target: Floats, registered: Floats, colours: NDArray[np.uint8], rings: dict[str, Floats]
 ) -> str:
-    """Draw ties in plan, coloured by misfit, with the misfit itself as a line, enlarged.
+    """Draw tie points in plan, coloured by residual, with the residual itself as a line, enlarged.
 
     Args:
         target: (n, 3) target ends in metres.
@@ -105,11 +106,15 @@ def misfit_map(
         colour = drawing.SOURCE_RGB if role == "source" else drawing.TARGET_RGB
         points = " ".join(f"{x:.1f},{y:.1f}" for x, y in place(ring))
         parts.append(f'<polyline points="{points}" fill="none" stroke="{_css(colour)}" stroke-width="1.5"/>')
-    misfit = registered[:, :2] - target[:, :2]
-    length = np.linalg.norm(misfit, axis=1)
+    surface_residual = registered[:, :2] - target[:, :2]
+    length = np.linalg.norm(surface_residual, axis=1)
     enlarge = _round_number(0.04 * size / max(float(np.median(length)), 1e-4))
-    # a few wild ties must not cover the map with lines
-    drawn = misfit * np.minimum(1.0, 0.12 * size / np.maximum(length * enlarge, 1e-9))[:, None] * enlarge
+    # a few wild tie points must not cover the map with lines
+    drawn = (
+        surface_residual
+        * np.minimum(1.0, 0.12 * size / np.maximum(length * enlarge, 1e-9))[:, None]
+        * enlarge
+    )
     ends = place(target[:, :2] + drawn)
     for (x, y), (u, v), colour in zip(place(target[:, :2]), ends, colours, strict=True):
         parts.append(
@@ -137,6 +142,6 @@ def _css(colour: Sequence[int] | NDArray[np.uint8]) -> str:
 
 
 def _round_number(value: float) -> float:
-    """Give the largest of 1, 2, 5 times a power of ten that is not above a positive number."""
+    """Return the largest of 1, 2, 5 times a power of ten that is not above a positive number."""
     power = 10.0 ** np.floor(np.log10(max(value, 1e-9)))
     return float(max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-9)) * power)

@@ -32,7 +32,7 @@ def verdict_meaning(verdict: Verdict) -> str:
 
 
 def metric_rows(metrics: Mapping[str, Any]) -> list[Row]:
-    """Give numbers as (name in words, value with its unit), read from the unit in each name."""
+    """Return numbers as (name in words, value with its unit), read from the unit in each name."""
     rows = []
     for key, value in metrics.items():
         if isinstance(value, Mapping):
@@ -66,7 +66,7 @@ def side_rows(side: Side) -> list[Row]:
 
 
 def transform_rows(pair: Pair) -> list[Row]:
-    """Say what the transform does: yaw, tilt, how the middle of the source moves, how ties fit."""
+    """Say what the transform does: yaw, tilt, how the middle of the source moves, how tie points fit."""
     if pair.T_target_source is None:
         return []
     R = pair.T_target_source[:3, :3]
@@ -80,13 +80,13 @@ def transform_rows(pair: Pair) -> list[Row]:
     offset = TransformChain.of(pair).vertical_offset_m
     if offset is not None:
         rows.append(("height offset found", f"{offset:+.3f} m, added to the source's heights"))
-    if pair.ties is not None and len(pair.ties.target):
-        inlier = np.asarray(pair.ties.inlier, bool)
-        rows.append(("ties", f"{len(inlier)}, of which {int(inlier.sum())} agree with the transform"))
+    if pair.tie_points is not None and len(pair.tie_points.target):
+        inlier = np.asarray(pair.tie_points.inlier, bool)
+        rows.append(("tie_points", f"{len(inlier)}, of which {int(inlier.sum())} agree with the transform"))
         if inlier.any():
-            off = misfits(pair)[inlier]
+            off = surface_residuals(pair)[inlier]
             plan, height = np.median(np.hypot(off[:, 0], off[:, 1])), np.median(np.abs(off[:, 2]))
-            rows.append(("misfit of those", f"median {plan:.2f} m in plan, {height:.2f} m in height"))
+            rows.append(("residual of those", f"median {plan:.2f} m in plan, {height:.2f} m in height"))
     icp = pair.refine_report.get("icp")
     if icp:
         rows.append(("refined by", refinement_text(icp)))
@@ -95,13 +95,13 @@ def transform_rows(pair: Pair) -> list[Row]:
 
 def refinement_text(icp: Mapping[str, Any]) -> str:
     """Say which of the refinements was taken, from the report of `mtpcr_geo.method.refine.follow_icp`."""
-    misfit = icp["tried"][icp["chosen"]]["misfit"]
+    surface_residual = icp["tried"][icp["chosen"]]["surface_residual"]
     if icp["followed"]:
         rounds = ", ".join(f"{one['reach_m']:g}" for one in icp["rounds"])
-        return f"ICP ({icp['method']}) with reaches of {rounds} m; surface misfit {misfit:.2f}"
-    why = "ICP lost the ties" if icp["lost_ties"] else "after ICP surfaces met worse"
-    kept = {"ties": "the ties alone", "ground": "ties and ground"}[icp["chosen"]]
-    return f"{kept}: {why}; surface misfit {misfit:.2f}"
+        return f"ICP ({icp['method']}) with reaches of {rounds} m; surface residual {surface_residual:.2f}"
+    why = "ICP lost the tie points" if icp["lost_tie_points"] else "after ICP surfaces met worse"
+    kept = {"tie_points": "the tie points alone", "ground": "tie points and ground"}[icp["chosen"]]
+    return f"{kept}: {why}; surface residual {surface_residual:.2f}"
 
 
 def units_text(link: FrameLink) -> str:
@@ -146,7 +146,7 @@ def _way_rows(link: FrameLink) -> list[Row]:
 
 
 def worked_example(pair: Pair) -> tuple[Floats, Floats] | None:
-    """Give one point, the middle of the source, before and after: (3,) source and target file coordinates.
+    """Return one point, the middle of the source, before and after: (3,) source and target file coordinates.
 
     The way goes through the whole chain, not through the single 4x4, so it can serve to check that.
     """
@@ -157,14 +157,14 @@ def worked_example(pair: Pair) -> tuple[Floats, Floats] | None:
     return before, TransformChain.of(pair).forward(before[np.newaxis])[0]
 
 
-def misfits(pair: Pair) -> Floats:
-    """Give registered source minus target of each tie, (n, 3) metres; NaN where there is no transform."""
+def surface_residuals(pair: Pair) -> Floats:
+    """Return registered source minus target of each tie point, (n, 3) metres; NaN without a transform."""
     target, registered = tie_positions(pair)
     return np.full_like(target, np.nan) if registered is None else registered - target
 
 
 def hypothesis_rows(pair: Pair) -> list[tuple[str, ...]]:
-    """Give the candidate poses as (rank, yaw, shift, score, overlap) in words, best first."""
+    """Return the candidate poses as (rank, yaw, shift, score, overlap) in words, best first."""
     if pair.matches is None:
         return []
     cell = pair.target.bev.grid.cell if pair.target.bev is not None else math.nan
@@ -186,7 +186,7 @@ def matrix_text(T: Floats) -> str:
 
 
 def plain(value: Any) -> str:
-    """Give any option or property as one short line."""
+    """Return any option or property as one short line."""
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, np.ndarray):

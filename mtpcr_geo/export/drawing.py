@@ -82,13 +82,13 @@ def shaded_relief(top: NDArray[np.float32], cell: float) -> Picture:
 
 
 def thinned(bev: Bev, max_side: int) -> tuple[NDArray[np.float32], float, int]:
-    """Give a BEV's heights with at most `max_side` cells a side: every n-th cell, the cell's edge, and n."""
+    """Return a BEV's heights with at most `max_side` cells a side: every n-th cell, its edge, and n."""
     step = max(1, -(-max(bev.grid.shape) // max_side))
     return bev.top[::step, ::step], bev.grid.cell * step, step
 
 
 def height_range(z: NDArray[np.floating]) -> tuple[float, float]:
-    """Give the heights in metres between which colours shall run: the middle 96 % of those given."""
+    """Return the heights in metres between which colours shall run: the middle 96 % of those given."""
     if z.size == 0:
         return 0.0, 1.0
     step = max(1, z.size // 20_000)
@@ -114,7 +114,7 @@ def residual_colours(residual_m: Floats, good_m: float, bad_m: float) -> Picture
 
 
 def residual_limits(residual_m: Floats, inlier: NDArray[np.bool_]) -> tuple[float, float]:
-    """Give where green ends and red begins, from the inliers' own spread, in whole centimetres."""
+    """Return where green ends and red begins, from the inliers' own spread, in whole centimetres."""
     if not inlier.any():
         return 0.1, 0.5
     low = max(round(2.0 * float(np.median(residual_m[inlier])), 2), 0.02)
@@ -143,12 +143,13 @@ def match_lines(
 ) -> tuple[Picture, Floats, NDArray[np.uint8], NDArray[np.int8]]:
     """Lay out both BEVs side by side (source left) with the lines that link them.
 
-    Ties are drawn once there are any (they know inliers), else the matches themselves. Of a BEV with more
+    Tie points are drawn once there are any (they know inliers), else the matches themselves. Of a BEV with
+    more
     than `max_side` cells a side only every n-th is drawn.
 
     Returns:
         the picture; (n, 2, 2) line ends in its pixels (column, row; pixel centres at integers);
-        (n, 3) colours; (n,) kind: 0 outlier, 1 inlier, 2 withheld, 3 not yet judged.
+        (n, 3) colours; (n,) kind: 0 outlier, 1 inlier, 2 held out, 3 not yet judged.
 
     Raises:
         ValueError: if the pair has no BEVs or no matches yet.
@@ -161,14 +162,14 @@ def match_lines(
     target_top, target_cell, target_step = thinned(target, max_side)
     left, right = band_grey(source_top, source_cell), band_grey(target_top, target_cell)
     picture, (column, row) = side_by_side(left, right, gap)
-    if pair.ties is None:
+    if pair.tie_points is None:
         source_px, target_px = pair.matches.source_px, pair.matches.target_px
         kind = np.full(len(source_px), 3, np.int8)
     else:
-        source_px = source.grid.to_pixel(pair.ties.source[:, :2])
-        target_px = target.grid.to_pixel(pair.ties.target[:, :2])
-        kind = np.where(pair.ties.inlier, 1, 0).astype(np.int8)
-        kind[np.asarray(pair.ties.withheld, bool) & np.asarray(pair.ties.inlier, bool)] = 2
+        source_px = source.grid.to_pixel(pair.tie_points.source[:, :2])
+        target_px = target.grid.to_pixel(pair.tie_points.target[:, :2])
+        kind = np.where(pair.tie_points.inlier, 1, 0).astype(np.int8)
+        kind[np.asarray(pair.tie_points.held_out, bool) & np.asarray(pair.tie_points.inlier, bool)] = 2
         if pair.T_target_source is None:
             kind[:] = 3
     offset_left = np.array([0.0, (picture.shape[0] - left.shape[0]) // 2])
@@ -282,7 +283,7 @@ def checkerboard(source: Bev, target: Bev, tile_m: float = 20.0) -> Picture:
 
 
 def step_edges(top: NDArray[np.float32]) -> Floats:
-    """Give height steps as (h, w) 0..1: the range within 3x3 filled cells, from 1 m (0) to 4 m (1)."""
+    """Return height steps as (h, w) 0..1: the range within 3x3 filled cells, from 1 m (0) to 4 m (1)."""
     import cv2
 
     filled = np.isfinite(top)

@@ -169,7 +169,7 @@ def registered_bev(pair: Pair) -> Bev:
 
 
 def grid_around(bev: Bev, T_to_bev: Floats) -> Grid:
-    """Give the grid, aligned to whole cells, that holds a BEV's filled cells moved by a 4x4 transform."""
+    """Return the grid, aligned to whole cells, that holds a BEV's filled cells moved by a 4x4 transform."""
     cell = bev.grid.cell
     filled = np.isfinite(bev.top)
     rows = np.flatnonzero(filled.any(axis=1))
@@ -237,7 +237,7 @@ def _look_back(
 
 
 def geotransform(grid: Grid, origin: Floats) -> Any:
-    """Give the affine from pixel corners to CRS coordinates of a grid whose frame has this origin."""
+    """Return the affine from pixel corners to CRS coordinates of a grid whose frame has this origin."""
     from affine import Affine
 
     return Affine(
@@ -246,7 +246,7 @@ def geotransform(grid: Grid, origin: Floats) -> Any:
 
 
 def overview_factors(grid: Grid) -> list[int]:
-    """Give the powers of two at which a raster of this size deserves overviews."""
+    """Return the powers of two at which a raster of this size deserves overviews."""
     factors = []
     factor = 2
     while max(grid.width, grid.height) / factor >= _SMALLEST_OVERVIEW:

@@ -13,7 +13,7 @@ SOURCE, TARGET = "230,97,1", "33,102,172"
 
 
 def residual_style(limits_m: tuple[float, float] = (0.1, 0.5)) -> str:
-    """Give a QML for points coloured by `residual_m`: green below, yellow between, red above the limits."""
+    """Return a QML for points coloured by `residual_m`: green below, yellow between, red above the limits."""
     low, high = limits_m
     rules = (
         (f'"residual_m" < {low:g}', f"below {low:g} m", GOOD),
@@ -25,7 +25,7 @@ def residual_style(limits_m: tuple[float, float] = (0.1, 0.5)) -> str:
 
 
 def link_style(limits_m: tuple[float, float] = (0.1, 0.5)) -> str:
-    """Give a QML for lines coloured by `residual_m`, like the ties they belong to."""
+    """Return a QML for lines coloured by `residual_m`, like the tie points they belong to."""
     low, high = limits_m
     rules = (
         (f'"residual_m" < {high:g}', f"below {high:g} m", GOOD if high <= low else FAIR),
@@ -35,7 +35,7 @@ def link_style(limits_m: tuple[float, float] = (0.1, 0.5)) -> str:
 
 
 def footprint_style() -> str:
-    """Give a QML for footprints: outlines only, the source in orange and the target in blue."""
+    """Return a QML for footprints: outlines only, the source in orange and the target in blue."""
     rules = (
         ("\"role\" = 'target'", "target", TARGET),
         ("\"role\" = 'source'", "source, registered", SOURCE),

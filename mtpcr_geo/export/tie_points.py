@@ -1,4 +1,4 @@
-"""What links the two clouds, as a GeoPackage with a CRS: ties, their misfits, footprints, candidates."""
+"""The links between both clouds as a GeoPackage: tie points, residuals, footprints, hypotheses."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ Fields = dict[str, NDArray[Any]]
 _FOOTPRINT_POINTS = 40_000
 
 
-def write_ties(path: str | Path, pair: Pair) -> None:
+def write_tie_points(path: str | Path, pair: Pair) -> None:
     """Write what links the clouds, as far as the run came, for looking at in a GIS.
 
     Layers, all in the CRS of the work frame (the target's; none for local clouds), coordinates absolute:
 
-    - ``ties``: 3D points at the target's end, with ``residual_m`` (and its parts ``dx_m``, ``dy_m``,
-      ``dz_m``: registered source minus target), ``score``, ``inlier``, ``withheld`` and the source's
+    - ``tie_points``: 3D points at the target's end, with ``residual_m`` (and its parts ``dx_m``, ``dy_m``,
+      ``dz_m``: registered source minus target), ``score``, ``inlier``, ``held out`` and the source's
       coordinates as they stand in its file;
-    - ``links``: 3D lines from the registered source's end to the target's end of each tie;
+    - ``links``: 3D lines from the registered source's end to the target's end of each tie point;
     - ``footprints``: convex outlines of the target and of the registered source;
     - ``hypotheses``: where each candidate pose puts the middle of the source, with yaw and score.
 
@@ -40,7 +40,7 @@ def write_ties(path: str | Path, pair: Pair) -> None:
 
     """
     layers = [_footprints(pair)]
-    if pair.ties is not None and len(pair.ties.target):
+    if pair.tie_points is not None and len(pair.tie_points.target):
         layers.append(_ties(pair))
         if pair.T_target_source is not None:
             layers.append(_links(pair))
@@ -50,26 +50,26 @@ def write_ties(path: str | Path, pair: Pair) -> None:
 
 
 def tie_positions(pair: Pair) -> tuple[Floats, Floats | None]:
-    """Give the ties in upright work coordinates of the target, metres.
+    """Return the tie points in upright work coordinates of the target, metres.
 
     Returns:
         (n, 3) target ends and (n, 3) source ends as the transform places them (None if not solved).
 
     Raises:
-        ValueError: if the pair has no ties yet.
+        ValueError: if the pair has no tie points yet.
 
     """
-    if pair.ties is None:
-        raise ValueError("the pair has no ties yet")
-    target = transforms.apply(transforms.inverse(pair.target.T_level_work), pair.ties.target)
+    if pair.tie_points is None:
+        raise ValueError("the pair has no tie points yet")
+    target = transforms.apply(transforms.inverse(pair.target.T_level_work), pair.tie_points.target)
     if pair.T_target_source is None:
         return target, None
     T_target_levelled = pair.T_target_source @ transforms.inverse(pair.source.T_level_work)
-    return target, transforms.apply(T_target_levelled, pair.ties.source)
+    return target, transforms.apply(T_target_levelled, pair.tie_points.source)
 
 
 def outline(plan: Floats) -> NDArray[np.int64]:
-    """Give the indices of those of (n, 2) points that make their convex outline, in order."""
+    """Return the indices of those of (n, 2) points that make their convex outline, in order."""
     import cv2
 
     near = np.asarray(plan[:, :2] - plan[:1, :2], np.float32)
@@ -77,7 +77,7 @@ def outline(plan: Floats) -> NDArray[np.int64]:
 
 
 def footprints(pair: Pair) -> dict[str, Floats]:
-    """Give the convex outlines, as closed (m, 2) rings in work coordinates of the target, metres.
+    """Return the convex outlines, as closed (m, 2) rings in work coordinates of the target, metres.
 
     Some ten thousand points of each sample are looked at: enough for a footprint.
 
@@ -100,42 +100,42 @@ def footprints(pair: Pair) -> dict[str, Floats]:
 
 
 def _ties(pair: Pair) -> Layer:
-    ties = pair.ties
-    assert ties is not None
+    tie_points = pair.tie_points
+    assert tie_points is not None
     target, registered = tie_positions(pair)
-    source_work = transforms.apply(transforms.inverse(pair.source.T_level_work), ties.source)
+    source_work = transforms.apply(transforms.inverse(pair.source.T_level_work), tie_points.source)
     source_file = pair.source.link.to_file(source_work)
-    misfit = np.full((len(target), 3), np.nan) if registered is None else registered - target
+    surface_residual = np.full((len(target), 3), np.nan) if registered is None else registered - target
     fields: Fields = {
-        "tie": np.arange(len(target), dtype=np.int32),
-        "residual_m": np.linalg.norm(misfit, axis=1),
-        "dx_m": misfit[:, 0],
-        "dy_m": misfit[:, 1],
-        "dz_m": misfit[:, 2],
-        "score": np.asarray(ties.score, np.float64),
-        "inlier": np.asarray(ties.inlier, bool),
-        "withheld": np.asarray(ties.withheld, bool),
+        "tie_point": np.arange(len(target), dtype=np.int32),
+        "residual_m": np.linalg.norm(surface_residual, axis=1),
+        "dx_m": surface_residual[:, 0],
+        "dy_m": surface_residual[:, 1],
+        "dz_m": surface_residual[:, 2],
+        "score": np.asarray(tie_points.score, np.float64),
+        "inlier": np.asarray(tie_points.inlier, bool),
+        "held_out": np.asarray(tie_points.held_out, bool),
         "source_x": source_file[:, 0],
         "source_y": source_file[:, 1],
         "source_z": source_file[:, 2],
     }
-    about = "ties at the target's end; residual: registered source minus target, metres"
+    about = "tie points at the target's end; residual: registered source minus target, metres"
     places = list((target + pair.frame.origin)[:, None, :])
-    return Layer("ties", "POINT", places, fields, about, styles.residual_style(_limits(pair)))
+    return Layer("tie_points", "POINT", places, fields, about, styles.residual_style(_limits(pair)))
 
 
 def _links(pair: Pair) -> Layer:
     target, registered = tie_positions(pair)
     assert registered is not None
-    assert pair.ties is not None
+    assert pair.tie_points is not None
     lines = list(np.stack([registered, target], axis=1) + pair.frame.origin)
     fields: Fields = {
-        "tie": np.arange(len(target), dtype=np.int32),
+        "tie_point": np.arange(len(target), dtype=np.int32),
         "residual_m": np.linalg.norm(registered - target, axis=1),
-        "inlier": np.asarray(pair.ties.inlier, bool),
-        "withheld": np.asarray(pair.ties.withheld, bool),
+        "inlier": np.asarray(pair.tie_points.inlier, bool),
+        "held_out": np.asarray(pair.tie_points.held_out, bool),
     }
-    about = "from each tie's registered source end to its target end"
+    about = "from each tie point's registered source end to its target end"
     return Layer("links", "LINESTRING", lines, fields, about, styles.link_style(_limits(pair)))
 
 
@@ -179,9 +179,9 @@ def _hypotheses(pair: Pair) -> Layer:
 def _limits(pair: Pair) -> tuple[float, float]:
     """Where green ends and red begins, from the inliers' own spread, rounded to centimetres."""
     target, registered = tie_positions(pair)
-    assert pair.ties is not None
-    if registered is None or not pair.ties.inlier.any():
+    assert pair.tie_points is not None
+    if registered is None or not pair.tie_points.inlier.any():
         return 0.1, 0.5
-    spread = float(np.median(np.linalg.norm(registered - target, axis=1)[pair.ties.inlier]))
+    spread = float(np.median(np.linalg.norm(registered - target, axis=1)[pair.tie_points.inlier]))
     low = max(round(2.0 * spread, 2), 0.02)
     return low, round(3.0 * low, 2)

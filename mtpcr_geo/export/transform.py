@@ -218,7 +218,7 @@ def _is_rigid(T: Floats) -> bool:
 
 
 def _examples(pair: Pair, chain: TransformChain) -> Floats:
-    """Give up to four points of the source, (n, 3) file coordinates, as worked examples."""
+    """Return up to four points of the source, (n, 3) file coordinates, as worked examples."""
     sample = pair.source.sample
     if not len(sample):
         return chain.pivot[None]
@@ -301,7 +301,7 @@ def _array(value: Any, shape: tuple[int, ...]) -> Floats:
 
 
 def _cloudcompare(chain: TransformChain) -> dict[str, Any]:
-    """Give the matrix on shifted coordinates, and the shifts with which it holds."""
+    """Return the matrix on shifted coordinates, and the shifts with which it holds."""
     source, target = _file_origin(chain.source), _file_origin(chain.target)
     if np.abs(source - target).max() < _SHARED_SHIFT:
         source = target
@@ -321,7 +321,7 @@ def _cloudcompare(chain: TransformChain) -> dict[str, Any]:
 
 
 def _file_origin(link: FrameLink) -> Floats:
-    """Give whole file units near the link's origin."""
+    """Return whole file units near the link's origin."""
     return np.asarray(np.rint(link.to_file(np.zeros((1, 3)))[0]))
 
 
@@ -330,7 +330,7 @@ def _row_major(T: Floats) -> str:
 
 
 def _pdal_link(link: FrameLink, inverse: bool) -> list[dict[str, Any]]:
-    """Give the PDAL stages from file to unshifted work coordinates, or back."""
+    """Return the PDAL stages from file to unshifted work coordinates, or back."""
     stages: list[dict[str, Any]] = []
     if link.pipeline is not None:
         stages.append({"type": "filters.projpipeline", "coord_op": link.pipeline})

@@ -54,12 +54,12 @@ def las_table(record: Any, xyz: NDArray[np.float64]) -> PointTable:
 
 
 def noise_of_record(record: Any) -> NDArray[np.bool_]:
-    """Tell which points of a laspy record are classified as noise or flagged withheld, (n,)."""
+    """Return which points of a laspy record are classified as noise or flagged withheld, (n,)."""
     return _noise(np.asarray(record["classification"]), np.asarray(record["withheld"]))
 
 
 def noise_of_table(table: PointTable) -> NDArray[np.bool_]:
-    """Tell which points of a table are classified as noise or flagged withheld, (n,)."""
+    """Return which points of a table are classified as noise or flagged withheld, (n,)."""
     classification, flags = split_classification(table)
     if classification is None:
         return np.zeros(len(table["X"]), bool)
@@ -74,7 +74,7 @@ def _noise(classification: NDArray[Any], withheld: NDArray[Any]) -> NDArray[np.b
 def split_classification(
     table: PointTable,
 ) -> tuple[NDArray[np.uint8] | None, dict[str, NDArray[np.uint8]]]:
-    """Give class and flags of a table, however its version of PDAL holds them.
+    """Return class and flags of a table, however its version of PDAL holds them.
 
     PDAL from 2.6 on has one dimension a flag. Before that the flags stand in ``ClassFlags`` for point
     formats 6 and up, and in the upper three bits of ``Classification`` for the others.

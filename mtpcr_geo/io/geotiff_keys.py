@@ -54,7 +54,7 @@ def crs_of_geokeys(directory: bytes, doubles: bytes, text: bytes) -> CRS | None:
 
 
 def _simple_keys(directory: bytes) -> dict[int, int]:
-    """Give the keys whose value stands in the directory itself."""
+    """Return the keys whose value stands in the directory itself."""
     entries = struct.iter_unpack("<4H", directory[8 : len(directory) // 8 * 8])
     return {key: value for key, place, _, value in entries if place == 0 and key != 0}
 

@@ -120,7 +120,7 @@ class LasCloud(Cloud):
 
 
 def xyz_of(record: Any) -> NDArray[np.float64]:
-    """Give the (n, 3) float64 coordinates of a laspy point record."""
+    """Return the (n, 3) float64 coordinates of a laspy point record."""
     xyz = np.empty((len(record), 3))
     for axis, name in enumerate("XYZ"):
         np.multiply(record.array[name], record.scales[axis], out=xyz[:, axis])

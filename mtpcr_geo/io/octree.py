@@ -152,7 +152,7 @@ _NOTHING = np.zeros(0, np.int64)
 
 
 def _grid_code(cells: Cells, level: int) -> NDArray[np.int64]:
-    """Give the number of the cell of its node's grid in which each point lies, (n,)."""
+    """Return the number of the cell of its node's grid in which each point lies, (n,)."""
     grid = (cells >> _BITS - level - _GRID_BITS).astype(np.int64) & (1 << _GRID_BITS) - 1
     return np.asarray(grid[:, 0] << 2 * _GRID_BITS | grid[:, 1] << _GRID_BITS | grid[:, 2])
 

@@ -48,7 +48,7 @@ class OutputSet:
             raise OutputError(f"cannot write to {folder}; choose a folder you may write to")
 
     def path(self, final: str | Path) -> Path:
-        """Give the passing name under which to write what shall become `final`.
+        """Return the passing name under which to write what shall become `final`.
 
         Raises:
             OutputError: as `check`, or if two stages want to write the same file.
@@ -68,7 +68,7 @@ class OutputSet:
         return part
 
     def template(self, final: str | Path) -> Path:
-        """Give the passing name for numbered files: the # in it is for a number, as in PDAL's writers.
+        """Return the passing name for numbered files: the # in it is for a number, as in PDAL's writers.
 
         Raises:
             OutputError: if the folder cannot be written.

@@ -130,7 +130,7 @@ class _Subset:
             self.points = np.concatenate([self.points, np.empty_like(self.points)])
             return
         keys = self.keys[: self.size]
-        # keys are 53 bit random numbers: ties are possible in theory, hence the cut by rank
+        # keys are 53 bit random numbers: equal ones are possible in theory, hence the cut by rank
         chosen = np.sort(np.argpartition(keys, self.budget)[: self.budget])
         self.bound = float(keys[chosen].max())
         self.points[: self.budget] = self.points[chosen]

@@ -38,7 +38,7 @@ def parse_bounds(text: str) -> Box:
 
 
 def xyz_of(table: PointTable) -> Floats:
-    """Give the (n, 3) float64 coordinates of a table of points."""
+    """Return the (n, 3) float64 coordinates of a table of points."""
     return np.stack([np.asarray(table[axis], np.float64) for axis in "XYZ"], axis=1)
 
 

@@ -43,12 +43,12 @@ class Record:
 
     @property
     def states_crs(self) -> bool:
-        """Whether the record is one of those that say the coordinate reference system."""
+        """Return whether the record is one of those that say the coordinate reference system."""
         return self.record_id in _CRS_RECORDS and self.user_id in ("LASF_Projection", "liblas")
 
     @property
     def is_kept(self) -> bool:
-        """Whether the record still holds for the same points in another file and place."""
+        """Return whether the record still holds for the same points in another file and place."""
         key = (self.user_id, self.record_id)
         layout = self.user_id in _LAYOUT_USERS or key in (_SUPERSEDED, _WAVEFORM_PACKETS, EXTRA_BYTES)
         return not (self.states_crs or layout)

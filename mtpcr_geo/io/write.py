@@ -67,12 +67,12 @@ def write_cloud(
     header, chunks = layout(cloud, crs)
     with task as report:
 
-        def told(count: int) -> None:
+        def reported(count: int) -> None:
             report(count)
             if advance is not None:
                 advance(count)
 
-        placed = _placed(header, chunks, move, _scales(cloud, crs, scale), told)
+        placed = _placed(header, chunks, move, _scales(cloud, crs, scale), reported)
         try:
             if is_copc(path):
                 from mtpcr_geo.io.copc import write_copc
@@ -90,7 +90,7 @@ def write_cloud(
 
 
 def is_copc(path: Path) -> bool:
-    """Tell by its name whether a file shall be COPC: ``.copc.laz``, also while it has its passing name."""
+    """Return by its name whether a file shall be COPC: ``.copc.laz``, also while it has its passing name."""
     suffixes = [suffix.lower() for suffix in path.suffixes]
     return suffixes[-1:] == [".laz"] and ".copc" in suffixes
 

@@ -97,7 +97,7 @@ class ImageMatcher(Protocol):
 
     @property
     def any_yaw(self) -> bool:
-        """Whether it finds its way at any angle; else the source is turned for it."""
+        """Return whether it finds its way at any angle; else the source is turned for it."""
 
     def prepare(self, image: Grey, empty: int) -> Any:
         """Do what concerns one image alone; the target's is done once and used for every orientation.
@@ -117,11 +117,11 @@ class Matcher(Protocol):
 
     @property
     def needs_image(self) -> bool:
-        """Whether the views must carry images."""
+        """Return whether the views must carry images."""
 
     @property
     def needs_one_cell(self) -> bool:
-        """Whether both rasters must have cells of one size."""
+        """Return whether both rasters must have cells of one size."""
 
     def match(
         self, source: View, target: View, *, seed: int = 0, yaw: float | None = None, advance: Advance = ...

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import RegistrationError
-from mtpcr_geo.core.statistics import chance_within, surprise
+from mtpcr_geo.core.statistics import chance_within, neg_log10_p
 from mtpcr_geo.core.types import Bev, Hypothesis, Matches
 from mtpcr_geo.match.patches import PatchMatches, match_patches
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
@@ -31,7 +31,7 @@ LARGEST_SEARCH = 420
 """Cells along a raster's side up to which a level is searched over all yaws in about two seconds."""
 PEAKS_A_YAW = 3
 HYPOTHESES = 10
-HOPELESS_BELOW = 0.5
+DROPPED_BELOW = 0.5
 """Share of the best score below which a hypothesis is not followed further."""
 REACH_CELLS = 4
 """How far the final patch matches may lie from where the pose puts them, cells."""
@@ -61,7 +61,7 @@ class CorrelationSettings:
     min_overlap_m2: float = 400.0
     min_overlap_share: float = 0.03
     convincing_margin: float = 1.5
-    convincing_surprise: float = 20.0
+    convincing_neg_log10_p: float = 20.0
 
 
 @dataclass(frozen=True)
@@ -110,12 +110,12 @@ class Candidate:
         return max(float(self.supporting.sum()) - 2.0, 0.0) / max(self.patches.patches, 8)
 
     @property
-    def surprise(self) -> float:
+    def neg_log10_p(self) -> float:
         """Digits of improbability that so many of the patches matched agree by chance."""
         if self.patches is None or self.supporting is None:
             return 0.0
         agreeing = max(int(self.supporting.sum()) - 2, 0)
-        return surprise(agreeing, len(self.patches), chance_within(AGREE_CELLS, REACH_CELLS - 0.5))
+        return neg_log10_p(agreeing, len(self.patches), chance_within(AGREE_CELLS, REACH_CELLS - 0.5))
 
     @property
     def strength(self) -> float:
@@ -157,11 +157,11 @@ def match(
         found = _search(pyramid, factor, settings, advance, prior)
         searched.append({"cell_m": source.grid.cell * factor, "scores": [round(p.score, 3) for p in found]})
         pool = _distinct([*pool, *(_descend(pyramid, factor, pose) for pose in found)])
-        pool = _distinct([_judge_by_patches(pyramid, c, settings, seed) for c in _worth_judging(pool)])
+        pool = _distinct([_score_patches(pyramid, c, settings, seed) for c in _worth_judging(pool)])
         if (
             pool
             and margin_of(pool) >= settings.convincing_margin
-            and pool[0].surprise >= settings.convincing_surprise
+            and pool[0].neg_log10_p >= settings.convincing_neg_log10_p
         ):
             break
     if not pool:
@@ -179,7 +179,7 @@ def match(
         "searched": searched,
         "margin": margin_of(pool),
         "support": best.support,
-        "surprise_digits": best.surprise,
+        "neg_log10_p": best.neg_log10_p,
         "support_next": max((c.support for c in pool[1:]), default=0.0),
         "patches": matches.patches,
         "scores": [round(c.pose.score, 3) for c in pool],
@@ -202,7 +202,7 @@ class Pyramid:
         self._layers: dict[int, tuple[Layer, Layer]] = {}
 
     def at(self, factor: int) -> tuple[Layer, Layer]:
-        """Give source and target layers at ``factor`` times the finest cell."""
+        """Return source and target layers at ``factor`` times the finest cell."""
         if factor not in self._layers:
             coarse = [coarsen(bev, factor) for bev in self._bevs]
             source, target = (Layer(bev.grid, channels(bev)) for bev in coarse)
@@ -258,7 +258,7 @@ def _search(
         yaws = prior.yaws(np.radians(settings.yaw_step_deg))
     poses = search.run(yaws, PEAKS_A_YAW, 4, advance)
     apart = distinct(poses, HYPOTHESES, np.radians(2 * settings.yaw_step_deg), 5 * cell)
-    return [pose for i, pose in enumerate(apart) if i < 3 or pose.score >= HOPELESS_BELOW * apart[0].score]
+    return [pose for i, pose in enumerate(apart) if i < 3 or pose.score >= DROPPED_BELOW * apart[0].score]
 
 
 def _descend(pyramid: Pyramid, factor: int, pose: Pose) -> Candidate:
@@ -287,7 +287,7 @@ def _descend(pyramid: Pyramid, factor: int, pose: Pose) -> Candidate:
 def _worth_judging(pool: Sequence[Candidate]) -> list[Candidate]:
     """Leave out what scores far below the best; the runner-up always stays, for the margin's sake."""
     best = max((c.pose.score for c in pool), default=0.0)
-    return [c for i, c in enumerate(pool) if i < 2 or c.pose.score >= HOPELESS_BELOW * best]
+    return [c for i, c in enumerate(pool) if i < 2 or c.pose.score >= DROPPED_BELOW * best]
 
 
 def _distinct(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -304,7 +304,7 @@ def _same(a: Pose, b: Pose) -> bool:
     return angle_between(a.yaw, b.yaw) < np.radians(5.0) and apart < 12.0
 
 
-def _judge_by_patches(
+def _score_patches(
     pyramid: Pyramid, candidate: Candidate, settings: CorrelationSettings, seed: int
 ) -> Candidate:
     """Match patches around a hypothesis, let them correct it, and match again from there."""

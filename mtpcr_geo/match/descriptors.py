@@ -37,7 +37,7 @@ class Pairing(Protocol):
     def pair(
         self, source: Features, target: Features, shapes: tuple[tuple[int, int], tuple[int, int]]
     ) -> tuple[Indices, Floats]:
-        """Give (m, 2) indices into both, and (m,) scores in 0..1; shapes are (h, w) of the images."""
+        """Return (m, 2) indices into both, and (m,) scores in 0..1; shapes are (h, w) of the images."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class NearestNeighbours:
     def pair(
         self, source: Features, target: Features, shapes: tuple[tuple[int, int], tuple[int, int]]
     ) -> tuple[Indices, Floats]:
-        """Give (m, 2) indices and (m,) scores: 1 less the ratio of the two nearest distances."""
+        """Return (m, 2) indices and (m,) scores: 1 less the ratio of the two nearest distances."""
         if len(source) < 1 or len(target) < 2:
             return np.empty((0, 2), np.int64), np.empty(0)
         nearest, first, second = _two_nearest(source.descriptors, target.descriptors)

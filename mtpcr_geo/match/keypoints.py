@@ -48,8 +48,8 @@ class Orientation:
     found: PixelMatches
     T: Floats
     agreeing: NDArray[np.bool_]
-    rival: Floats
-    rival_count: int
+    runner_up: Floats
+    runner_up_count: int
 
     @property
     def count(self) -> int:
@@ -240,13 +240,13 @@ def _judge(
     s, t = source.to_metres(found.source_px), target.to_metres(found.target_px)
     T, agreeing = ransac_upright(s, t, tolerance, seed, TRIES)
     left = ~agreeing
-    rival, also = ransac_upright(s[left], t[left], tolerance, seed, TRIES)
-    return Orientation(turn, found, T, agreeing, rival, max(int(also.sum()) - 2, 0))
+    runner_up, also = ransac_upright(s[left], t[left], tolerance, seed, TRIES)
+    return Orientation(turn, found, T, agreeing, runner_up, max(int(also.sum()) - 2, 0))
 
 
 def _hypotheses(tried: list[Orientation]) -> tuple[Hypothesis, ...]:
-    """Give all poses found, those with most agreeing matches first; alike ones once."""
-    poses = [(one.count, one.T) for one in tried] + [(one.rival_count, one.rival) for one in tried]
+    """Return all poses found, those with most agreeing matches first; alike ones once."""
+    poses = [(one.count, one.T) for one in tried] + [(one.runner_up_count, one.runner_up) for one in tried]
     kept: list[Hypothesis] = []
     for count, T in sorted(poses, key=lambda pose: -pose[0]):
         yaw = transforms.yaw_of(T[:3, :3])
@@ -262,7 +262,7 @@ def _hypotheses(tried: list[Orientation]) -> tuple[Hypothesis, ...]:
 
 
 def margin_of(hypotheses: tuple[Hypothesis, ...]) -> float:
-    """Give how many times more matches agree on the best pose than on the next, if any do.
+    """Return how many times more matches agree on the best pose than on the next, if any do.
 
     Repetitive scenes, such as rows of like houses, give several poses that many matches agree on.
     """

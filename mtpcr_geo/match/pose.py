@@ -73,7 +73,7 @@ def warp_to(source: Image, source_grid: Grid, target_grid: Grid, pose: Pose) -> 
 
 
 def source_from_target_pixels(source_grid: Grid, target_grid: Grid, pose: Pose) -> Floats:
-    """Give the (2, 3) affine map from target pixels to source pixels under a pose."""
+    """Return the (2, 3) affine map from target pixels to source pixels under a pose."""
     pivot = centre_of(source_grid)
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     offset = target_grid.to_metres(corners) - np.array([pose.east, pose.north])

@@ -76,14 +76,14 @@ class Rasteriser:
         self._count += np.bincount(cell, minlength=len(self._count)).astype(np.uint32)
 
     def _cells(self, xyz: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Give the column and the row of (n, 3) points, inside the raster or not."""
+        """Return the column and the row of (n, 3) points, inside the raster or not."""
         grid = self.grid
         column = np.floor((xyz[:, 0] - grid.west) * (1.0 / grid.cell)).astype(np.int64)
         row = np.floor((grid.north - xyz[:, 1]) * (1.0 / grid.cell)).astype(np.int64)
         return column, row
 
     def finish(self) -> Bev:
-        """Give the raster of everything added so far."""
+        """Return the raster of everything added so far."""
         empty = self._count == 0
         top = np.where(empty, np.float32(np.nan), self._top).reshape(self.grid.shape)
         low = np.where(empty, np.float32(np.nan), self._low).reshape(self.grid.shape)

@@ -18,7 +18,7 @@ LATTICE_M = 0.00037
 
 
 def near(points: Floats, others: Floats, reach: float) -> NDArray[np.bool_]:
-    """Tell which points may have one of the others within reach, by cubes of that edge."""
+    """Return which points may have one of the others within reach, by cubes of that edge."""
     (low_p, high_p), (low_o, high_o) = transforms.bounds(points), transforms.bounds(others)
     span = np.maximum(high_p, high_o) - np.minimum(low_p, low_o)
     edge = max(reach, float(np.cbrt(np.prod(span + 4 * reach) / MOST_CUBES)))

@@ -142,7 +142,7 @@ def overlap_share(T: Floats, source: Floats, target: Floats) -> float:
 
 
 def neighbourhood(xyz: Floats, centres: Floats, radius_m: float) -> Floats:
-    """Give the (n, 3) points that lie within a radius of any of (k, 2) centres, seen from above."""
+    """Return the (n, 3) points that lie within a radius of any of (k, 2) centres, seen from above."""
     import cv2
 
     low, high = transforms.bounds(xyz[:, :2])

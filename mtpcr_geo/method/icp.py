@@ -90,7 +90,7 @@ class Surfaces:
         *,
         voxel_m: float = 0.5,
         reach_m: float = FAR_REACH_M[0],
-        most_points: int = 30_000,
+        max_points: int = 30_000,
         threads: int = 2,
     ) -> None:
         import small_gicp
@@ -111,8 +111,8 @@ class Surfaces:
         self._threads = threads
         self._pivot = np.floor(target[of_target].mean(axis=0))
         # each cloud is thinned in its own frame, so that a hair's breadth at the start changes no point
-        s = transforms.apply(T_start, thinned(source[of_source], of_source, voxel_m, most_points))
-        t = thinned(target[of_target], of_target, voxel_m, 3 * most_points)
+        s = transforms.apply(T_start, thinned(source[of_source], of_source, voxel_m, max_points))
+        t = thinned(target[of_target], of_target, voxel_m, 3 * max_points)
         self._s, self._t = s - self._pivot, t - self._pivot
         self._source, self._target = small_gicp.PointCloud(self._s), small_gicp.PointCloud(self._t)
         self._source_tree = self._with_surfaces(self._source)
@@ -139,7 +139,7 @@ class Surfaces:
         """
         import small_gicp
 
-        X, told = self._relative(T_from), []
+        X, reported = self._relative(T_from), []
         trimmed = self._source if rounds.trim_m is None else self._trimmed(X, rounds.trim_m)
         for number, reach in enumerate(rounds.reach_m, 1):
             # what a round leaves is taken up by the next; only the last must stand still
@@ -158,7 +158,7 @@ class Surfaces:
                 translation_epsilon=patience * STILL_M,
             )
             X = np.array(result.T_target_source)
-            told.append(
+            reported.append(
                 {
                     "reach_m": reach,
                     "iterations": int(result.iterations),
@@ -168,10 +168,10 @@ class Surfaces:
             )
         X[:3, :3] = transforms.orthonormal(X[:3, :3])
         T = transforms.translation(self._pivot) @ X @ transforms.translation(-self._pivot) @ self.T_start
-        return Descent(T, told)
+        return Descent(T, reported)
 
-    def misfit(self, T: Floats) -> float:
-        """Tell how badly flat surfaces of the source meet the target: 0 all meet, 1 none does.
+    def surface_residual(self, T: Floats) -> float:
+        """Return how badly flat surfaces of the source meet the target: 0 all meet, 1 none does.
 
         Each gap along the surface's normal costs ``gap^2 / (gap^2 + 0.1^2)`` (Geman and McClure), so that
         what grew, was built or stands in one cloud only weighs alike wherever a transform puts it. The sum
@@ -199,7 +199,7 @@ class Surfaces:
         return tree
 
     def _trimmed(self, X: Floats, within_m: float) -> Any:
-        """Give the source's points that have a partner near by; all, where those are too few."""
+        """Return the source's points that have a partner near by; all, where those are too few."""
         import small_gicp
 
         squared = np.asarray(self._tree.batch_knn_search(transforms.apply(X, self._s), 1, self._threads)[1])

@@ -48,7 +48,7 @@ def masked_blur(image: Image, mask: Image, sigma_cells: float) -> Image:
 
 
 def filled_height(bev: Bev) -> tuple[Image, Image]:
-    """Give the highest z relative to its median, 0 where empty, and the mask of filled cells."""
+    """Return the highest z relative to its median, 0 where empty, and the mask of filled cells."""
     filled = bev.count > 0
     middle = np.median(bev.top[filled]) if filled.any() else 0.0
     height = np.where(filled, bev.top - np.float32(middle), np.float32(0))
@@ -149,5 +149,5 @@ def image_of(bev: Bev, look: Look) -> Grey:
 
 
 def empty_grey(look: Look) -> int:
-    """Give the grey value of empty cells in an image of that look."""
+    """Return the grey value of empty cells in an image of that look."""
     return EMPTY_GREY if look == "band_pass" else 0

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo.core.types import Bev, Matches, Ties
+from mtpcr_geo.core.types import Bev, Matches, TiePoints
 from mtpcr_geo.method.paper import height_span
 
 Floats = NDArray[np.float64]
@@ -17,7 +17,7 @@ Pixel = Literal["centre", "ceil"]
 GROUND_RADIUS_M = 4.0
 
 
-def lift(
+def inverse_mapping(
     matches: Matches,
     source: Bev,
     target: Bev,
@@ -27,11 +27,12 @@ def lift(
     folds: int = 4,
     block_m: float = 40.0,
     seed: int = 0,
-) -> Ties:
-    """Lift matches to ties in levelled coordinates, and set some aside to judge the result by.
+) -> TiePoints:
+    """Lift matches to tie points in levelled coordinates, and set some aside to judge the result by.
 
-    The ties of whole square blocks of the target go into one fold, so that ties withheld are no neighbours of
-    those the transform is solved from. Ties without a height on either side are left out.
+    The tie points of whole square blocks of the target go into one fold, so that tie points held out are
+    no neighbours of
+    those the transform is solved from. Tie points without a height on either side are left out.
 
     Args:
         matches: pixel pairs.
@@ -40,21 +41,21 @@ def lift(
         surface: "ground" takes the lowest z around the pixel, which both clouds see under canopy and
             eaves; "top" takes the highest z of the cell; "grey" has it in 255 steps, as in the paper.
         pixel: "centre" puts a pixel at the centre of its cell; "ceil" at the north-east corner (Eq. 5).
-        folds: parts into which the blocks are dealt; the first is withheld from the solve.
+        folds: parts into which the blocks are dealt; the first is held out from the solve.
         block_m: edge of a block, metres.
         seed: chooses the blocks.
 
     """
-    s = lifted(matches.source_px, source, surface, pixel)
-    t = lifted(matches.target_px, target, surface, pixel)
+    s = pixels_to_3d(matches.source_px, source, surface, pixel)
+    t = pixels_to_3d(matches.target_px, target, surface, pixel)
     known = np.isfinite(s[:, 2]) & np.isfinite(t[:, 2])
     s, t, score = s[known], t[known], matches.score[known]
     fold = folds_of(t[:, :2], folds, block_m, seed)
-    return Ties(s, t, score, fold, fold == 0, np.ones(len(s), bool))
+    return TiePoints(s, t, score, fold, fold == 0, np.ones(len(s), bool))
 
 
-def lifted(px: Floats, bev: Bev, surface: Surface, pixel: Pixel = "centre") -> Floats:
-    """Give (n, 3) metres of (n, 2) pixels, see `lift`; z is NaN where the raster is empty."""
+def pixels_to_3d(px: Floats, bev: Bev, surface: Surface, pixel: Pixel = "centre") -> Floats:
+    """Return (n, 3) metres of (n, 2) pixels, see `lift`; z is NaN where the raster is empty."""
     xy = bev.grid.to_metres(px)
     if pixel == "ceil":
         xy = xy + bev.grid.cell / 2

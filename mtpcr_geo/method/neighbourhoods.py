@@ -28,7 +28,7 @@ def local_shapes(
 
     """
     index = np.asarray(tree.batch_knn_search(places, neighbours, threads)[0]).astype(np.int64)
-    hood = points[index]
-    hood = hood - hood.mean(axis=1, keepdims=True)
-    values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", hood, hood))
+    neighbourhood = points[index]
+    neighbourhood = neighbourhood - neighbourhood.mean(axis=1, keepdims=True)
+    values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", neighbourhood, neighbourhood))
     return np.sqrt(np.maximum(values, 0.0)), axes

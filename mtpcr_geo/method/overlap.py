@@ -46,7 +46,7 @@ class Overlap:
         return float((filled & self.shared).sum()) / max(int(filled.sum()), 1)
 
     def select(self, xyz: Floats) -> Mask:
-        """Tell which (n, 3) points lie in the overlap."""
+        """Return which (n, 3) points lie in the overlap."""
         pixel = np.round(self.grid.to_pixel(xyz[:, :2])).astype(int)
         inside = ((pixel >= 0) & (pixel < [self.grid.width, self.grid.height])).all(axis=1)
         found = np.zeros(len(xyz), bool)

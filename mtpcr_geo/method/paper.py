@@ -35,7 +35,7 @@ COARSEST_CELL_M = 20.0
 
 
 def resolution(count: int, area_m2: float, gamma: float) -> float:
-    """Give RES, pixels per metre (Eq. 1): ``count * gamma / area``.
+    """Return RES, pixels per metre (Eq. 1): ``count * gamma / area``.
 
     The printed area is that of the bounding box; `mtpcr_geo.method.bev.density` gives the occupied one,
     which is our variant. As ``count / area`` is per square metre and RES per metre, gamma has the unit metre.
@@ -64,7 +64,7 @@ def usual_gamma(densities: tuple[float, ...], cell: float) -> float:
 
 
 def cell_of(res: float) -> float:
-    """Give the cell ``1 / RES`` in metres.
+    """Return the cell ``1 / RES`` in metres.
 
     Raises:
         RegistrationError: if it is of no use: below 0.1 m or above 20 m.
@@ -128,7 +128,7 @@ def grey(bev: Bev, *, printed: bool = False) -> Grey:
 
 
 def height_span(bev: Bev) -> tuple[float, float]:
-    """Give zmin and zmax over all points of a raster, metres; NaN where it is empty."""
+    """Return zmin and zmax over all points of a raster, metres; NaN where it is empty."""
     filled = bev.count > 0
     if not filled.any():
         return float("nan"), float("nan")

@@ -1,4 +1,4 @@
-"""Refinement: the height settled on the ground, and ICP followed where surfaces and ties bear it out."""
+"""Refinement: height settled on the ground, ICP followed where surfaces and tie points agree."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GROUND_NOISE_M = 0.5
 LEVEL_SIGMA_DEG = 1.0
 SCATTER_SHARE, SCATTER_M = 0.5, 0.03
 CLEARLY = 1.01
-"""Times that the misfit after ICP must exceed a start's for the start to be taken: on bare, sparse ground
+"""Times that the residual after ICP must exceed a start's for the start to be taken: on bare, sparse ground
 they are equal but for chance, and results would jump with it."""
 
 
@@ -46,7 +46,7 @@ def follow_icp(
     *,
     rounds: dict[str, Rounds],
     agreeing: Callable[[Floats], int],
-    keep_ties: float,
+    keep_tie_points: float,
     method: Method = "gicp",
     iterations: int = 30,
 ) -> Refinement:
@@ -54,15 +54,17 @@ def follow_icp(
 
     A far reach catches starts that are off by metres, but on open ground it lets the clouds slide; a near
     one does not. Neither is right where crops or bushes grew between the surveys and hold the least squares
-    off the ground, which `Surfaces.misfit` sees through. In plan only the ties have seen anything on open
+    off the ground, which `Surfaces.residual` sees through. In plan only the tie points have seen anything
+    on open
     ground, so what loses them is not followed.
 
     Args:
         surfaces: of both clouds.
         starts: 4x4 from source to target work coordinates by name; ICP starts from the last.
         rounds: the runs of ICP to try, by name.
-        agreeing: counts the ties that a transform brings together.
-        keep_ties: share of the ties agreeing at the last start that must still agree; 0 follows ICP always.
+        agreeing: counts the tie points that a transform brings together.
+        keep_tie_points: share of the tie points agreeing at the last start that must still agree; 0 follows ICP
+            always.
         method: of `Surfaces.descend`.
         iterations: at most, each round.
 
@@ -72,31 +74,34 @@ def follow_icp(
         name: surfaces.descend(starts[last], one, method=method, iterations=iterations)
         for name, one in rounds.items()
     }
-    tried = {name: T for name, T in starts.items() if keep_ties > 0} | {
+    tried = {name: T for name, T in starts.items() if keep_tie_points > 0} | {
         name: run.T for name, run in runs.items()
     }
-    wanted = keep_ties * agreeing(starts[last])
-    misfit = {name: surfaces.misfit(T) for name, T in tried.items()}
-    ties = {name: agreeing(T) for name, T in tried.items()}
-    kept = [name for name in tried if name == last or ties[name] >= wanted]
-    best = min(kept, key=lambda name: misfit[name] * (1.0 if name in runs else CLEARLY))
-    lost = [name for name in runs if name not in kept and misfit[name] < misfit[best]]
+    wanted = keep_tie_points * agreeing(starts[last])
+    surface_residual = {name: surfaces.surface_residual(T) for name, T in tried.items()}
+    tie_points = {name: agreeing(T) for name, T in tried.items()}
+    kept = [name for name in tried if name == last or tie_points[name] >= wanted]
+    best = min(kept, key=lambda name: surface_residual[name] * (1.0 if name in runs else CLEARLY))
+    lost = [name for name in runs if name not in kept and surface_residual[name] < surface_residual[best]]
     report = {
         "method": method,
         "voxel_m": surfaces.voxel_m,
         "points_source": surfaces.sizes[0],
         "points_target": surfaces.sizes[1],
-        "tried": {name: {"misfit": misfit[name], "ties": ties[name]} for name in tried},
+        "tried": {
+            name: {"surface_residual": surface_residual[name], "tie_points": tie_points[name]}
+            for name in tried
+        },
         "chosen": best,
         "followed": best in runs,
-        "lost_ties": bool(lost),
+        "lost_tie_points": bool(lost),
         **_moved(runs, best, starts[last]),
     }
     return Refinement(tried[best], report)
 
 
 def _moved(runs: dict[str, Descent], best: str, T_start: Floats) -> dict[str, Any]:
-    """Tell what the run that was followed did; nothing if none was."""
+    """Return what the run that was followed did; nothing if none was."""
     if best not in runs:
         return {}
     turn = runs[best].T[:3, :3] @ T_start[:3, :3].T
@@ -158,7 +163,7 @@ def settle_on_ground(
 
 
 def beyond_scatter(settled: Refinement) -> bool:
-    """Tell whether the ground's rise is more than where the borders of its cells run can make of it.
+    """Return whether the ground's rise is more than where the borders of its cells run can make of it.
 
     The lowest of a cell lies the lower the denser the cloud and the steeper the ground, by a part of the
     cells' own scatter. A fit to all points knows the height better than that.

@@ -1,7 +1,7 @@
-"""From ties to a rigid transform: iterative SVD with outlier rejection, and a robust start for it.
+"""From tie points to a rigid transform: iterative SVD with outlier rejection, and a robust start for it.
 
 One SVD over many outliers does not recover, however often it is repeated; with gravity known only a yaw and
-a shift remain, two ties determine them, and RANSAC over pairs of ties gives a start that does.
+a shift remain, two tie points determine them, and RANSAC over pairs of tie points gives a start that does.
 """
 
 from __future__ import annotations
@@ -63,17 +63,17 @@ def fit_upright(source: Floats, target: Floats, weight: Floats | None = None) ->
 def ransac_upright(
     source: Floats, target: Floats, tolerance: float, seed: int, iterations: int = 2000
 ) -> tuple[Floats, Mask]:
-    """Find the yaw and shift on which most ties agree in plan.
+    """Find the yaw and shift on which most tie points agree in plan.
 
     Args:
         source, target: (n, >=2) corresponding points, metres.
         tolerance: largest plan residual of an inlier, metres.
         seed: of the sampling.
-        iterations: pairs of ties tried.
+        iterations: pairs of tie points tried.
 
     Returns:
         4x4 transform refitted to its inliers (planar: no vertical part), and the (n,) inlier mask.
-        With fewer than two ties, the identity and an empty mask.
+        With fewer than two tie points, the identity and an empty mask.
 
     """
     n = len(source)
@@ -104,7 +104,7 @@ def ransac_upright(
 
 
 def _most_agreed(s: Floats, t: Floats, yaw: Floats, anchor: NDArray[np.int64], tolerance: float) -> Mask:
-    """Mark the ties that agree with the best of many poses, each a yaw about a tie that it maps exactly."""
+    """Mark the tie points that agree with the best of many poses, each exact at one tie point."""
     best, best_count = np.zeros(len(s), bool), -1
     # a few million numbers at a time
     step = max(1, 2_000_000 // len(s))
@@ -134,7 +134,7 @@ class Solution:
 
     Attributes:
         T: 4x4 from source to target.
-        inlier: (n,) ties within the final threshold.
+        inlier: (n,) tie points within the final threshold.
         iterations: rounds until nothing changed.
         threshold: final residual threshold, metres.
 
@@ -161,13 +161,14 @@ def iterative_svd(
     """Fit, drop what lies beyond ``factor`` robust standard deviations, and repeat until stable.
 
     Args:
-        source, target: (n, 3) ties, metres.
-        start: (n,) ties of the first fit; all if None (as in the paper).
+        source, target: (n, 3) tie points, metres.
+        start: (n,) tie points of the first fit; all if None (as in the paper).
         weight: (n,) weights.
         factor: residuals beyond this many times 1.4826 median residuals are outliers.
         floor: the threshold never falls below this, metres: below the raster's own precision a residual
             says nothing.
-        ceiling: nor does it rise above this, metres: from few ties that agree badly it would grow until it
+        ceiling: nor does it rise above this, metres: from few tie points that agree badly it would grow
+            until it
             takes in all.
         max_iterations: rounds at most.
         upright: solve yaw and shift only.
@@ -189,11 +190,11 @@ def iterative_svd(
     return Solution(T, inlier, rounds, threshold)
 
 
-def solve_ties(
+def solve_tie_points(
     source: Floats,
     target: Floats,
     score: Floats,
-    withheld: Mask,
+    held_out: Mask,
     *,
     tolerance: float,
     robust_start: bool = True,
@@ -201,31 +202,33 @@ def solve_ties(
     tries: int = 2000,
     seed: int = 0,
 ) -> tuple[Solution, Mask]:
-    """Solve the transform from the ties not withheld: robust start, then iterative SVD.
+    """Solve the transform from the tie points not held out: robust start, then iterative SVD.
 
     Args:
-        source, target: (n, 3) levelled ties, metres.
-        score: (n,) weights of the ties, squared in the fit.
-        withheld: (n,) ties to leave out.
-        tolerance: plan residual up to which a tie may agree with a pose, metres; about 1.5 cells.
-        robust_start: begin from the yaw and shift that RANSAC finds; else from all ties, as in the paper.
+        source, target: (n, 3) levelled tie points, metres.
+        score: (n,) weights of the tie points, squared in the fit.
+        held_out: (n,) tie points to leave out.
+        tolerance: plan residual up to which a tie point may agree with a pose, metres; about 1.5 cells.
+        robust_start: begin from the yaw and shift that RANSAC finds; else from all tie points, as in the
+            paper.
         upright: solve yaw and shift, trusting the levelling; else all six degrees of freedom.
-        tries: pairs of ties that RANSAC tries.
+        tries: pairs of tie points that RANSAC tries.
         seed: of RANSAC.
 
     Returns:
-        The solution, whose inlier mask covers the used ties only, and the (n,) mask of all ties within
-        the final threshold in plan, withheld ones included.
+        The solution, whose inlier mask covers the used tie points only, and the (n,) mask of all tie
+        points within
+        the final threshold in plan, held out ones included.
 
     Raises:
-        RegistrationError: if fewer ties agree than a transform needs.
+        RegistrationError: if fewer tie points agree than a transform needs.
 
     """
-    used = np.flatnonzero(~withheld)
+    used = np.flatnonzero(~held_out)
     least = 3
     if len(used) < least:
         raise RegistrationError(
-            f"only {len(used)} ties to solve a transform from, at least {least} are needed; "
+            f"only {len(used)} tie points to solve a transform from, at least {least} are needed; "
             "the clouds share too little, or another --cell or matcher may find more"
         )
     s, t = source[used], target[used]
@@ -234,14 +237,14 @@ def solve_ties(
         _, start = ransac_upright(s, t, tolerance, seed, tries)
         if start.sum() < least:
             raise RegistrationError(
-                f"of {len(used)} ties no {least} agree on one yaw and shift; the clouds may not overlap"
+                f"of {len(used)} tie points no {least} agree on one yaw and shift; the clouds may not overlap"
             )
-    # the start says to what distance ties agree; as in the paper there is no such bound
+    # the start says to what distance tie points agree; as in the paper there is no such bound
     ceiling = 2.0 * tolerance if robust_start else np.inf
     weight = np.maximum(score[used], 0.05) ** 2
     flat = np.array([1.0, 1.0, 0.0])
     if upright:
-        # heights of single ties are rough, so they have no say in plan and are settled by their median
+        # heights of single tie points are rough, so they have no say in plan and are settled by their median
         solution = iterative_svd(
             s * flat, t * flat, start=start, weight=weight, floor=tolerance, ceiling=ceiling, upright=True
         )

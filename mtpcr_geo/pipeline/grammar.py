@@ -68,12 +68,12 @@ class Element:
 
     @property
     def is_reader(self) -> bool:
-        """Whether it starts a chain."""
+        """Return whether it starts a chain."""
         return self.type.startswith("readers.")
 
     @property
     def is_writer(self) -> bool:
-        """Whether it leaves a file."""
+        """Return whether it leaves a file."""
         return self.type.startswith("writers.")
 
     @property
@@ -316,7 +316,7 @@ def _inferred(raw: Mapping[str, Any], place: str, *, first: bool, last: bool) ->
 
 
 def file_of(options: Mapping[str, Any]) -> str | None:
-    """Give the filename among options: a string, or the path of PDAL's file specification."""
+    """Return the filename among options: a string, or the path of PDAL's file specification."""
     filename = options.get("filename")
     if isinstance(filename, Mapping):
         filename = filename.get("path")

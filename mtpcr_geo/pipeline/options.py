@@ -67,7 +67,7 @@ class RegisterOptions(MethodOptions):
 
 OUTPUT_NAMES = {
     "bev": Path("bev") / "#.tif",
-    "ties": Path("ties.gpkg"),
+    "tie_points": Path("ties.gpkg"),
     "transform": Path("transform.json"),
     "matrix": Path("transform.cloudcompare.txt"),
     "pdal": Path("transform.pdal.json"),

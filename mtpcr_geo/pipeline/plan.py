@@ -49,7 +49,7 @@ def plan(specs: Sequence[StageSpec], settings: Settings) -> dict[str, Stage]:
 
 
 def served_by_pdal(specs: Sequence[StageSpec]) -> set[str]:
-    """Tell which stages PDAL serves: those only it has, and readers and writers right beside them.
+    """Return which stages PDAL serves: those only it has, and readers and writers right beside them.
 
     Raises:
         OptionError: if neither knows a stage.
@@ -104,7 +104,7 @@ def _pdal_has(spec: StageSpec) -> bool:
 
 
 def _connect(specs: Sequence[StageSpec], stages: Mapping[str, Stage]) -> None:
-    """Tell every PDAL stage what stands before it, and whether PDAL must run once it is reached."""
+    """Return every PDAL stage what stands before it, and whether PDAL must run once it is reached."""
     from mtpcr_geo.pipeline.pdal.stages import PdalStage
 
     files: dict[str, Path | None] = {}

@@ -19,7 +19,7 @@ _MODULES = ("io", "rasters", "matching", "solving", "export", "register")
 
 @cache
 def stage_types() -> dict[str, type[Stage]]:
-    """Give every stage the package serves itself, by type, in the order of a run."""
+    """Return every stage the package serves itself, by type, in the order of a run."""
     found: dict[str, type[Stage]] = {}
     for name in _MODULES:
         module = importlib.import_module(f"mtpcr_geo.pipeline.stages.{name}")

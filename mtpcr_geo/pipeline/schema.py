@@ -16,7 +16,7 @@ _REPEATABLE = {"type": ["string", "number", "boolean", "object", "array", "null"
 
 
 def pipeline_schema() -> dict[str, Any]:
-    """Give the JSON Schema of a pipeline: our stages in full, and PDAL's as far as PDAL is here to ask."""
+    """Return the JSON Schema of a pipeline: our stages in full, and PDAL's as far as PDAL is here to ask."""
     definitions: dict[str, Any] = {}
     stages = [_own(kind, definitions) for kind in stage_types()]
     if library.available():

@@ -66,7 +66,7 @@ class RunContext:
     _scratch: tempfile.TemporaryDirectory[str] | None = None
 
     def scratch(self) -> Path:
-        """Give a folder for passing files, gone when the run ends."""
+        """Return a folder for passing files, gone when the run ends."""
         if self._scratch is None:
             self._scratch = tempfile.TemporaryDirectory(prefix="mtpcr-geo-")
         return Path(self._scratch.name)

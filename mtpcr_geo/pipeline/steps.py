@@ -9,7 +9,7 @@ from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.pipeline.options import MethodOptions
 
 MANY_TRIES = 20_000
-"""Pairs of ties tried for the robust start with keypoint matchers, of whose matches few may be right."""
+"""Pairs of tie points tried for the robust start with keypoint matchers: few matches may be right."""
 SWITCHES = ("force", "local")
 """Options that are off unless named."""
 
@@ -64,7 +64,7 @@ def _method(options: MethodOptions, seed: dict[str, int]) -> list[dict[str, Any]
     return [
         {"type": "mtpcr.bev", "tag": "bev", "cell": options.cell, "finest": finest},
         {"type": "mtpcr.match", "tag": "match", **match, **_prior(options), **seed},
-        {"type": "mtpcr.lift", "tag": "lift", **seed},
+        {"type": "mtpcr.inverse_mapping", "tag": "inverse_mapping", **seed},
         {"type": "mtpcr.solve", "tag": "solve", "tries": None if correlation else MANY_TRIES, **seed},
         {
             "type": "mtpcr.refine",
@@ -91,7 +91,13 @@ def _paper_method(options: MethodOptions, seed: dict[str, int]) -> list[dict[str
         steps.append({"type": "mtpcr.focus", "tag": "focus", **seed})
     return [
         *steps,
-        {"type": "mtpcr.lift", "tag": "lift", "surface": "grey", "pixel": "ceil", **seed},
+        {
+            "type": "mtpcr.inverse_mapping",
+            "tag": "inverse_mapping",
+            "surface": "grey",
+            "pixel": "ceil",
+            **seed,
+        },
         {"type": "mtpcr.solve", "tag": "solve", "upright": False, "robust_start": False, **seed},
         {
             "type": "mtpcr.refine",
@@ -99,7 +105,7 @@ def _paper_method(options: MethodOptions, seed: dict[str, int]) -> list[dict[str
             "method": "point_to_point",
             "ground": False,
             "reach": [3.0, 1.5, 0.75],
-            "keep_ties": 0,
+            "keep_tie_points": 0,
         },
         {"type": "mtpcr.assess", "tag": "assess"},
     ]

@@ -1,7 +1,8 @@
 """Assessment: whether a result may be believed.
 
 The verdict never rests on the fit's own residual. It rests on what the fit did not see or could not have
-arranged: ties withheld from the solve, how far the best hypothesis stands above the next distinct one, and
+arranged: tie points held out from the solve, how far the best hypothesis stands above the next distinct
+one, and
 how much ground both clouds share.
 """
 
@@ -13,17 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo.core.statistics import surprise
+from mtpcr_geo.core.statistics import neg_log10_p
 from mtpcr_geo.core.types import Verdict, VerdictName
 
 Floats = NDArray[np.float64]
 
 FEWEST_GROUND_CELLS = 30
 KEPT_SHARE = 0.5
-"""Share of the agreeing ties that refinement must not lose."""
+"""Share of the agreeing tie points that refinement must not lose."""
 
 UNBOUNDED_CHANCE = 0.02
-"""Chance agreement of a withheld tie whose matcher looks for it in the whole raster, judged generously."""
+"""Chance agreement of a held-out tie point whose matcher searches the whole raster: an upper bound."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +32,12 @@ class Evidence:
     """What a verdict rests on.
 
     Attributes:
-        withheld: number of ties withheld from the solve.
-        withheld_agreeing: of these, ties that the result brings together within the tolerance, in plan.
-        chance: share of withheld ties that would agree if they were random within the matcher's reach;
+        held_out: number of tie points held out from the solve.
+        held_out_agreeing: of these, tie points that the result brings together within the tolerance, in plan.
+        chance: share of held-out tie points that would agree if they were random within the matcher's reach;
             None where the matcher does not bound its matches, so that chance agreement is negligible.
         tolerance_m: the tolerance.
-        withheld_median_m: median plan residual of the agreeing withheld ties, metres.
+        held_out_median_m: median plan residual of the agreeing held-out tie points, metres.
         margin: strength of the best hypothesis over the next distinct one; None where the matcher gives none.
         support: share of the patches in the overlap that agree on the pose; None likewise.
         overlap_m2: area both clouds cover under the result, square metres.
@@ -44,16 +45,17 @@ class Evidence:
         ground_cells: cells where both see the ground.
         ground_agreeing: of these, cells whose heights agree.
         refined_away_m: how far the refinement moved the overlap from the solution in plan, metres.
-        final_agreeing: of all ties, those that agree with the final transform; None if not counted.
-        refinement_lost: whether surfaces fit better where the ties do not agree, and the ties were followed.
+        final_agreeing: of all tie points, those that agree with the final transform; None if not counted.
+        refinement_lost: whether surfaces fit better where the tie points do not agree, and the tie points
+            were followed.
 
     """
 
-    withheld: int
-    withheld_agreeing: int
+    held_out: int
+    held_out_agreeing: int
     chance: float | None
     tolerance_m: float
-    withheld_median_m: float | None
+    held_out_median_m: float | None
     margin: float | None
     support: float | None
     overlap_m2: float
@@ -71,20 +73,21 @@ class Limits:
     """Limits between the verdicts.
 
     Attributes:
-        surprise: digits of improbability that the withheld ties must reach to be believed: -log10 of the
+        surprise: digits of improbability that the held-out tie points must reach to be believed: -log10 of
+            the
             probability that chance makes so many agree.
         doubtful_surprise: below this the result is refused.
-        agreeing: share of the withheld ties that must agree to accept.
+        agreeing: share of the held-out tie points that must agree to accept.
         margin: least strength over the next hypothesis to accept.
         overlap_m2: least overlap to accept, square metres.
-        refined_away: most tolerances by which the refinement may move the overlap away from the ties.
+        refined_away: most tolerances by which the refinement may move the overlap away from the tie points.
         ground_agreeing: share of the common ground that must agree in height to accept, where any is seen.
             Of flat ground 60 to 66 % agrees under poses a whole block off, and 74 % and more under true ones.
 
     """
 
-    surprise: float = 6.0
-    doubtful_surprise: float = 3.0
+    neg_log10_p: float = 6.0
+    doubtful_neg_log10_p: float = 3.0
     agreeing: float = 0.15
     margin: float = 1.3
     overlap_m2: float = 400.0
@@ -101,19 +104,21 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
         more: further metrics to keep beside the verdict's own.
 
     """
-    digits = surprise_of(evidence)
-    share = evidence.withheld_agreeing / max(evidence.withheld, 1)
+    digits = neg_log10_p_of(evidence)
+    share = evidence.held_out_agreeing / max(evidence.held_out, 1)
     refusals, doubts = [], []
-    told = (
-        f"{evidence.withheld_agreeing} of {evidence.withheld} withheld ties agree "
+    reported = (
+        f"{evidence.held_out_agreeing} of {evidence.held_out} held-out tie points agree "
         f"within {evidence.tolerance_m:g} m"
     )
-    if evidence.withheld < 4:
-        doubts.append(f"only {evidence.withheld} ties could be withheld, too few to check the result by")
-    elif digits < limits.doubtful_surprise:
-        refusals.append(f"{told}, no more than chance would give")
-    elif digits < limits.surprise or share < limits.agreeing:
-        doubts.append(f"{told}, hardly more than chance would give")
+    if evidence.held_out < 4:
+        doubts.append(
+            f"only {evidence.held_out} tie points could be held out, too few to check the result by"
+        )
+    elif digits < limits.doubtful_neg_log10_p:
+        refusals.append(f"{reported}, no more than chance would give")
+    elif digits < limits.neg_log10_p or share < limits.agreeing:
+        doubts.append(f"{reported}, hardly more than chance would give")
     if evidence.margin is not None:
         if evidence.margin < 1.0:
             refusals.append(f"another pose fits better (margin {evidence.margin:.2f})")
@@ -122,13 +127,18 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
                 f"another pose fits nearly as well (margin {evidence.margin:.2f}, wanted {limits.margin:g})"
             )
     if evidence.refined_away_m > limits.refined_away * evidence.tolerance_m:
-        doubts.append(f"the refinement went {evidence.refined_away_m:.1f} m away from where the ties had led")
+        doubts.append(
+            f"the refinement went {evidence.refined_away_m:.1f} m away from where the tie points had led"
+        )
     if evidence.refinement_lost:
-        doubts.append("the refinement lost the ties and was not followed; the result is as exact as they are")
+        doubts.append(
+            "the refinement lost the tie points and was not followed; the result is as exact as they are"
+        )
     final = evidence.final_agreeing
-    if final is not None and final < KEPT_SHARE * evidence.withheld_agreeing:
+    if final is not None and final < KEPT_SHARE * evidence.held_out_agreeing:
         refusals.append(
-            f"the final transform agrees with {final} ties only, {evidence.withheld_agreeing} agreed before"
+            f"the final transform agrees with {final} tie points only, {evidence.held_out_agreeing} agreed "
+            f"before"
         )
     ground = evidence.ground_agreeing / max(evidence.ground_cells, 1)
     if evidence.ground_cells >= FEWEST_GROUND_CELLS and ground < limits.ground_agreeing:
@@ -137,13 +147,13 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
         refusals.append(f"the clouds share only {evidence.overlap_m2:.0f} m2 under this result")
     elif evidence.overlap_m2 < limits.overlap_m2:
         doubts.append(f"the clouds share only {evidence.overlap_m2:.0f} m2 under this result")
-    if len(doubts) >= 2 and digits < limits.surprise:
+    if len(doubts) >= 2 and digits < limits.neg_log10_p:
         refusals.append("several checks fail at once: " + "; ".join(doubts))
         doubts = []
     name: VerdictName = "refused" if refusals else "doubtful" if doubts else "accepted"
     reasons = [*refusals, *doubts]
     if name == "accepted":
-        reasons = [told]
+        reasons = [reported]
         if evidence.margin is not None:
             reasons.append(f"the next distinct pose is {evidence.margin:.1f} times weaker")
         reasons.append(
@@ -151,12 +161,12 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
             f"{evidence.overlap_target:.0%} of the target"
         )
     metrics: dict[str, Any] = {
-        "withheld_ties": evidence.withheld,
-        "withheld_agreeing": evidence.withheld_agreeing,
-        "withheld_agreeing_share": share,
-        "withheld_tolerance_m": evidence.tolerance_m,
-        "withheld_median_m": evidence.withheld_median_m,
-        "surprise_digits": digits,
+        "held_out_tie_points": evidence.held_out,
+        "held_out_agreeing": evidence.held_out_agreeing,
+        "held_out_agreeing_share": share,
+        "held_out_tolerance_m": evidence.tolerance_m,
+        "held_out_median_m": evidence.held_out_median_m,
+        "neg_log10_p": digits,
         "hypothesis_margin": evidence.margin,
         "patch_support": evidence.support,
         "overlap_m2": evidence.overlap_m2,
@@ -169,7 +179,7 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
     return Verdict(name, tuple(reasons), metrics | (more or {}))
 
 
-def surprise_of(evidence: Evidence) -> float:
-    """How improbable the agreement of the withheld ties is by chance, in digits."""
+def neg_log10_p_of(evidence: Evidence) -> float:
+    """How improbable the agreement of the held-out tie points is by chance, in digits."""
     chance = UNBOUNDED_CHANCE if evidence.chance is None else evidence.chance
-    return surprise(evidence.withheld_agreeing, evidence.withheld, chance)
+    return neg_log10_p(evidence.held_out_agreeing, evidence.held_out, chance)

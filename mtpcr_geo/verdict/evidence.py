@@ -9,24 +9,25 @@ import numpy as np
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.statistics import chance_within
-from mtpcr_geo.core.types import Floats, Pair, Ties
+from mtpcr_geo.core.types import Floats, Pair, TiePoints
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.method.overlap import overlap_of
-from mtpcr_geo.method.solve import solve_ties
+from mtpcr_geo.method.solve import solve_tie_points
 from mtpcr_geo.verdict.decision import Evidence
 
 GROUND_AGREES_M = 0.5
 UNBOUNDED_CELLS = 2.0
-TIES_A_PATCH = 4
-"""Patches overlap by half, so about four ties tell what one independent tie would."""
+TIE_POINTS_PER_PATCH = 4
+"""Patches overlap by half, so about four tie points tell what one independent tie would."""
 
 
 def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[str, Any]]:
     """Gather the evidence for a pair's transform.
 
     Args:
-        pair: solved, with rasters and ties.
-        tolerance: plan distance within which a withheld tie agrees, metres; if None, one cell, or two where
+        pair: solved, with rasters and tie points.
+        tolerance: plan distance within which a held-out tie point agrees, metres; if None, one cell, or
+            two where
             the matcher does not bound its matches: keypoints are coarser, and chance agreement rarer.
 
     Returns:
@@ -34,25 +35,25 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
 
     """
     assert pair.T_target_source is not None
-    assert pair.ties is not None
+    assert pair.tie_points is not None
     cell = pair.cell
     matched = pair.matches.report if pair.matches is not None else {}
     tolerance = tolerance or max(cell, 1.0) * (1.0 if "reach_m" in matched else UNBOUNDED_CELLS)
     T = pair.T_target_source
-    ties = pair.ties
+    tie_points = pair.tie_points
     T_level = pair.target.T_level_work @ T @ transforms.inverse(pair.source.T_level_work)
-    residual = np.hypot(*(transforms.apply(T_level, ties.source) - ties.target)[:, :2].T)
-    withheld = cross_validated(ties, tolerance, pair.solve_report)
-    agreeing = withheld < tolerance
+    residual = np.hypot(*(transforms.apply(T_level, tie_points.source) - tie_points.target)[:, :2].T)
+    held_out = cross_validated(tie_points, tolerance, pair.solve_report)
+    agreeing = held_out < tolerance
     moved = transforms.apply(T, pair.source.sample)
     overlap = overlap_of(moved, pair.target.sample)
     _, steps = overlap.ground_steps()
     evidence = Evidence(
-        withheld=len(withheld),
-        withheld_agreeing=int(agreeing.sum()),
+        held_out=len(held_out),
+        held_out_agreeing=int(agreeing.sum()),
         chance=chance_within(tolerance, matched["reach_m"]) if "reach_m" in matched else None,
         tolerance_m=tolerance,
-        withheld_median_m=float(np.median(withheld[agreeing])) if agreeing.any() else None,
+        held_out_median_m=float(np.median(held_out[agreeing])) if agreeing.any() else None,
         margin=matched.get("margin"),
         support=matched.get("support"),
         overlap_m2=overlap.area_m2,
@@ -61,7 +62,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         ground_cells=len(steps),
         ground_agreeing=int((np.abs(steps) < GROUND_AGREES_M).sum()),
         refined_away_m=_refined_away(pair, T),
-        refinement_lost=pair.refine_report.get("icp", {}).get("lost_ties", False),
+        refinement_lost=pair.refine_report.get("icp", {}).get("lost_tie_points", False),
         final_agreeing=int((residual < tolerance).sum()),
     )
     shift = T[:3, 3]
@@ -71,10 +72,10 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         "yaw_deg": float(np.degrees(transforms.yaw_of(T[:3, :3]))),
         "tilt_deg": float(np.degrees(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))),
         "shift_work_m": [float(v) for v in shift],
-        "ties": len(ties.score),
-        "ties_agreeing": int((residual < tolerance).sum()),
+        "tie_points": len(tie_points.score),
+        "tie_points_agreeing": int((residual < tolerance).sum()),
         **_uncertainty(
-            ties,
+            tie_points,
             residual,
             tolerance,
             transforms.apply(T_level, pair.source.levelled_sample.mean(axis=0)[None])[0],
@@ -84,32 +85,32 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
 
 
 def agreement(pair: Pair, T: Floats, tolerance: float | None = None) -> tuple[int, int]:
-    """Count what agrees with a transform: ties in plan, and cells of common ground in height.
+    """Count what agrees with a transform: tie points in plan, and cells of common ground in height.
 
     Args:
-        pair: with ties and rasters.
+        pair: with tie points and rasters.
         T: 4x4 from source to target work coordinates.
-        tolerance: plan distance within which a tie agrees, metres; one cell if None.
+        tolerance: plan distance within which a tie point agrees, metres; one cell if None.
 
     """
     _, steps = overlap_of(transforms.apply(T, pair.source.sample), pair.target.sample).ground_steps()
-    return ties_agreeing(pair, T, tolerance), int((np.abs(steps) < GROUND_AGREES_M).sum())
+    return tie_points_agreeing(pair, T, tolerance), int((np.abs(steps) < GROUND_AGREES_M).sum())
 
 
-def ties_agreeing(pair: Pair, T: Floats, tolerance: float | None = None) -> int:
-    """Count the ties that a transform brings together in plan; arguments as for `agreement`."""
-    if pair.ties is None:
+def tie_points_agreeing(pair: Pair, T: Floats, tolerance: float | None = None) -> int:
+    """Count the tie points that a transform brings together in plan; arguments as for `agreement`."""
+    if pair.tie_points is None:
         return 0
     T_level = pair.target.T_level_work @ T @ transforms.inverse(pair.source.T_level_work)
-    gap = transforms.apply(T_level, pair.ties.source) - pair.ties.target
+    gap = transforms.apply(T_level, pair.tie_points.source) - pair.tie_points.target
     return int((np.hypot(gap[:, 0], gap[:, 1]) < (tolerance or max(pair.cell, 1.0))).sum())
 
 
-def cross_validated(ties: Ties, tolerance: float, solved: dict[str, Any]) -> Floats:
-    """Withhold each fold in turn, solve from the others, and give every tie's plan residual while withheld.
+def cross_validated(tie_points: TiePoints, tolerance: float, solved: dict[str, Any]) -> Floats:
+    """Hold out each fold in turn, solve from the others, and return each tie point's plan residual.
 
     Args:
-        ties: ties with folds.
+        tie_points: tie points with folds.
         tolerance: as given to the solver, metres.
         solved: the solver's report, for the settings it ran with.
 
@@ -117,58 +118,61 @@ def cross_validated(ties: Ties, tolerance: float, solved: dict[str, Any]) -> Flo
         (n,) metres; infinite where the others gave no transform.
 
     """
-    residual = np.full(len(ties.score), np.inf)
-    for fold in np.unique(ties.fold):
-        out = ties.fold == fold
+    residual = np.full(len(tie_points.score), np.inf)
+    for fold in np.unique(tie_points.fold):
+        out = tie_points.fold == fold
         try:
-            solution, _ = solve_ties(
-                ties.source,
-                ties.target,
-                ties.score,
+            solution, _ = solve_tie_points(
+                tie_points.source,
+                tie_points.target,
+                tie_points.score,
                 out,
                 tolerance=1.5 * tolerance,
                 **solved.get("settings", {}),
             )
         except RegistrationError:
             continue
-        gap = transforms.apply(solution.T, ties.source[out]) - ties.target[out]
+        gap = transforms.apply(solution.T, tie_points.source[out]) - tie_points.target[out]
         residual[out] = np.hypot(gap[:, 0], gap[:, 1])
     return residual
 
 
 def _refined_away(pair: Pair, T: Floats) -> float:
-    """How far the refinement moved the middle of the ties in plan, metres.
+    """How far the refinement moved the middle of the tie points in plan, metres.
 
-    Height is not counted: ties are matched in plan, and take theirs from levelled rasters, which a degree
+    Height is not counted: tie points are matched in plan, and take theirs from levelled rasters, which a
+        degree
     of tilt raises by metres. That of the result is judged by the ground.
     """
     before = pair.refine_report.get("T_before")
-    if before is None or pair.ties is None or not len(pair.ties.source):
+    if before is None or pair.tie_points is None or not len(pair.tie_points.source):
         return 0.0
     middle = transforms.apply(
-        transforms.inverse(pair.source.T_level_work), pair.ties.source.mean(axis=0, keepdims=True)
+        transforms.inverse(pair.source.T_level_work), pair.tie_points.source.mean(axis=0, keepdims=True)
     )
     moved = transforms.apply(T, middle)[0] - transforms.apply(before, middle)[0]
     return float(np.hypot(*(pair.target.T_level_work[:3, :3] @ moved)[:2]))
 
 
-def _uncertainty(ties: Ties, residual: Floats, tolerance: float, centroid: Floats) -> dict[str, Any]:
-    """One standard deviation of yaw and plan position, from the scatter and spread of the ties.
+def _uncertainty(
+    tie_points: TiePoints, residual: Floats, tolerance: float, centroid: Floats
+) -> dict[str, Any]:
+    """One standard deviation of yaw and plan position, from the scatter and spread of the tie points.
 
     Args:
-        ties: all ties.
+        tie_points: all tie points.
         residual: (n,) their plan residuals, metres.
-        tolerance: within which a tie agrees, metres.
+        tolerance: within which a tie point agrees, metres.
         centroid: (3,) where the source's centroid comes to lie, in the target's levelled frame.
 
     """
     near = residual < 2.5 * tolerance
     if near.sum() < 6:
         return {"sigma_yaw_deg": None, "sigma_plan_m": None, "sigma_plan_source_centroid_m": None}
-    xy = ties.target[near, :2]
+    xy = tie_points.target[near, :2]
     # a Rayleigh median is 1.1774 standard deviations of one coordinate
     scatter = float(np.median(residual[near])) / 1.1774
-    independent = max(float(near.sum()) / TIES_A_PATCH, 1.5)
+    independent = max(float(near.sum()) / TIE_POINTS_PER_PATCH, 1.5)
     middle = xy.mean(axis=0)
     arm = max(float(np.sqrt(((xy - middle) ** 2).sum(axis=1).mean())), 1.0)
     plan = scatter / np.sqrt(independent)

@@ -169,7 +169,7 @@ def test_ours_answers_with_a_verdict(clouds):
     assert answer.verdict == "accepted"
     assert answer.T_target_source is not None
     assert np.abs(answer.T_target_source - T_true).max() < 0.05
-    assert answer.details["withheld_ties"] > 10
+    assert answer.details["held_out_tie_points"] > 10
     blind = methods.make_method("mtpcr-geo").estimate(
         source, np.array(target[:, [0, 1, 2]] * [1, 1, 0]), seed=0
     )

@@ -1,4 +1,4 @@
-"""What GIS programs read back from the rasters and the ties, by value."""
+"""What GIS programs read back from the rasters and the tie points, by value."""
 
 from __future__ import annotations
 
@@ -142,17 +142,17 @@ def test_warp_by_whole_cells_is_exact():
 def test_ties_open_in_gdal_where_they_belong(tmp_path):
     pyogrio = pytest.importorskip("pyogrio")
     pair = make_pair(3000)
-    tie_points.write_ties(tmp_path / "t.gpkg", pair)
+    tie_points.write_tie_points(tmp_path / "t.gpkg", pair)
     layers = dict(pyogrio.list_layers(tmp_path / "t.gpkg"))
-    assert layers["ties"] == "Point Z"
+    assert layers["tie_points"] == "Point Z"
     assert layers["links"] == "LineString Z"
     assert layers["footprints"] == "Polygon"
-    info, _, shapes, fields = pyogrio.raw.read(tmp_path / "t.gpkg", layer="ties")
+    info, _, shapes, fields = pyogrio.raw.read(tmp_path / "t.gpkg", layer="tie_points")
     table = dict(zip(info["fields"], fields, strict=True))
     assert info["crs"] == "EPSG:25833"
     xyz = np.array([struct.unpack("<BI3d", shape)[2:] for shape in shapes])
-    assert np.allclose(xyz, pair.ties.target + ORIGIN)
-    assert table["withheld"].sum() == 16
+    assert np.allclose(xyz, pair.tie_points.target + ORIGIN)
+    assert table["held_out"].sum() == 16
     assert table["inlier"].dtype == bool
     source = np.column_stack([table["source_x"], table["source_y"], table["source_z"]])
     moved = transforms.apply(pair.T_file, source)
@@ -171,7 +171,7 @@ def test_footprints_of_both_clouds_coincide():
 
 def test_hypotheses_place_the_middle_of_the_source(tmp_path):
     pair = make_pair(3000)
-    tie_points.write_ties(tmp_path / "t.gpkg", pair)
+    tie_points.write_tie_points(tmp_path / "t.gpkg", pair)
     with closing(sqlite3.connect(tmp_path / "t.gpkg")) as base:
         rows = base.execute("SELECT rank, yaw_deg, shift_x_m, geom FROM hypotheses ORDER BY rank").fetchall()
     assert len(rows) == 5
@@ -185,12 +185,12 @@ def test_hypotheses_place_the_middle_of_the_source(tmp_path):
 
 @pytest.mark.parametrize(("state", "layers"), [("levelled", 1), ("matched", 2), ("tied", 3), ("solved", 4)])
 def test_ties_of_an_unfinished_run(tmp_path, state, layers):
-    tie_points.write_ties(tmp_path / "t.gpkg", make_pair(1000, state=state))
+    tie_points.write_tie_points(tmp_path / "t.gpkg", make_pair(1000, state=state))
     with closing(sqlite3.connect(tmp_path / "t.gpkg")) as base:
         (count,) = base.execute("SELECT count(*) FROM gpkg_contents WHERE data_type = 'features'").fetchone()
         assert count == layers
         if state == "tied":
-            (missing,) = base.execute("SELECT count(*) FROM ties WHERE residual_m IS NULL").fetchone()
+            (missing,) = base.execute("SELECT count(*) FROM tie_points WHERE residual_m IS NULL").fetchone()
             assert missing == 80
 
 
@@ -216,4 +216,4 @@ def test_geometry_bytes_by_hand():
 
 def test_unwritable_ties_are_our_error(tmp_path):
     with pytest.raises(OutputError, match="cannot write"):
-        tie_points.write_ties(tmp_path / "no" / "t.gpkg", make_pair(500))
+        tie_points.write_tie_points(tmp_path / "no" / "t.gpkg", make_pair(500))

@@ -30,15 +30,15 @@ def states(pair: Pair):
     levelled = Pair(*bare, pair.frame)
     bev = levelled.with_(target=pair.target, source=pair.source)
     matched = bev.with_(matches=pair.matches)
-    lifted = matched.with_(ties=pair.ties)
-    solved = lifted.with_(T_target_source=pair.T_target_source)
+    pixels_to_3d = matched.with_(tie_points=pair.tie_points)
+    solved = pixels_to_3d.with_(T_target_source=pair.T_target_source)
     refined = solved.with_(T_target_source=None if solved.T_target_source is None else true_transform())
     return [
         ("source", pair.source.cloud),
         ("level", levelled),
         ("bev", bev),
         ("match", matched),
-        ("lift", lifted),
+        ("inverse_mapping", pixels_to_3d),
         ("solve", solved),
         ("refine", refined),
         ("assess", refined.with_(verdict=pair.verdict)),
@@ -95,8 +95,8 @@ def test_every_stage_left_its_trace(whole):
     wanted = {
         "/input/source", "/input/target", "/levelled/source", "/levelled/target",
         "/bev/source/relief", "/bev/target/bandpass", "/bev/target/height",
-        "/matches/image", "/matches/agreeing/lines", "/matches/withheld/lines", "/matches/disagreeing/lines",
-        "/hypotheses/scores", "/aligned/source/points", "/aligned/target/points", "/aligned/ties",
+        "/matches/image", "/matches/agreeing/lines", "/matches/held_out/lines", "/matches/disagreeing/lines",
+        "/hypotheses/scores", "/aligned/source/points", "/aligned/target/points", "/aligned/tie_points",
         "/aligned/links", "/residuals", "/map/source", "/map/target", "/stages", "/seconds", "/summary",
         "/run",
     }  # fmt: skip
@@ -159,7 +159,7 @@ def test_footprints_are_where_the_site_is(whole):
 def test_the_verdict_is_told_in_words(whole):
     text = rows(whole, "/summary")[-1]["TextDocument:text"][0]
     assert text.startswith("# Accepted")
-    assert "16 withheld ties agree to 0.11 m" in text
+    assert "16 held-out tie points agree to 0.11 m" in text
     assert "| yaw | +33.0000°" in text
 
 

@@ -78,7 +78,8 @@ def test_it_tells_what_where_and_how_sure(tmp_path):
     pair = make_pair(3000)
     html = report(tmp_path, pair)
     for text in (
-        "16 withheld ties agree to 0.11 m", "ETRS89 / UTM zone 33N", "+33.0000°", "withheld inlier share",
+        "16 held-out tie points agree to 0.11 m", "ETRS89 / UTM zone 33N", "+33.0000°", "held out inlier "
+        "share",
         "81.0 %", "cd" * 32, "source.laz", "1,234 bytes", "method auto", "no &lt;match&gt;", "numpy",
     ):  # fmt: skip
         assert text in html
@@ -201,7 +202,7 @@ def test_residual_colours_run_from_green_to_red():
 def test_charts_count_every_tie():
     residual = np.array([0.0, 0.01, 0.5, 7.0])
     svg = charts.histogram(residual, residual < 0.3, 1.0)
-    assert sum(int(number) for number in re.findall(r"<title>(\d+) ties", svg)) == 4
+    assert sum(int(number) for number in re.findall(r"<title>(\d+) tie points", svg)) == 4
     assert "a &lt;b&gt;" in charts.bars([1.0, 0.0], ["a <b>", "c"])
 
 
@@ -231,5 +232,5 @@ def test_report_says_which_refinement_was_taken_and_why() -> None:
     assert "0.31" in followed
     kept = {**ICP_REPORT, "chosen": "ground", "followed": False}
     assert "surfaces met worse" in descriptions.refinement_text(kept)
-    assert "lost the ties" in descriptions.refinement_text({**kept, "lost_ties": True})
+    assert "lost the tie points" in descriptions.refinement_text({**kept, "lost_tie_points": True})
     assert ("refined by", followed) in descriptions.transform_rows(make_pair(500))

@@ -257,9 +257,8 @@ def test_paper_profile_runs_the_whole_path(town_files, small_models, tmp_path):
         *town_files, tmp_path / "out", profile="paper", matcher="superpoint", models=small_models
     )
     types = [entry["type"] for entry in result.report]
-    assert [t for t in types if t in ("mtpcr.enhance", "mtpcr.match", "mtpcr.focus", "mtpcr.lift")] == [
-        "mtpcr.enhance", "mtpcr.match", "mtpcr.focus", "mtpcr.lift"
-    ]  # fmt: skip
+    steps = ["mtpcr.enhance", "mtpcr.match", "mtpcr.focus", "mtpcr.inverse_mapping"]
+    assert [t for t in types if t in steps] == steps
     assert result.verdict.name in ("accepted", "doubtful", "refused")
 
 
@@ -308,9 +307,9 @@ def test_focus_matches_again_where_overlap_is_small():
     assert not kept.report["focus"]["applied"]
     np.testing.assert_array_equal(kept.source_px, first.source_px)
     forced = focus(own, first, *subjects, view, FocusSettings(theta=1.0, finer=1.5, radius_m=40.0))
-    told = forced.report["focus"]
-    assert told["applied"]
-    assert told["agreeing_after"] > told["agreeing_before"]
+    reported = forced.report["focus"]
+    assert reported["applied"]
+    assert reported["agreeing_after"] > reported["agreeing_before"]
     assert forced.before_focus is first
     from mtpcr_geo.export.recording.matching import Pen, log_focus
 
@@ -398,10 +397,10 @@ def test_ready_pipeline_of_the_paper_is_that_of_the_profile():
 
 
 def test_models_command_lists_files_licences_and_terms(small_models):
-    told = CliRunner().invoke(app, ["models", "--models", str(small_models)])
-    assert told.exit_code == 0
-    assert "non-commercial research only" in told.output
-    assert "xfeat.onnx: missing" in told.output
+    reported = CliRunner().invoke(app, ["models", "--models", str(small_models)])
+    assert reported.exit_code == 0
+    assert "non-commercial research only" in reported.output
+    assert "xfeat.onnx: missing" in reported.output
     listed = json.loads(CliRunner().invoke(app, ["models", "--models", str(small_models), "--json"]).output)
     superpoint = next(model for model in listed["models"] if model["name"] == "superpoint")
     assert superpoint["usable"]
@@ -410,9 +409,9 @@ def test_models_command_lists_files_licences_and_terms(small_models):
 
 def test_models_command_without_a_folder(monkeypatch):
     monkeypatch.delenv("MTPCR_GEO_MODELS", raising=False)
-    told = CliRunner().invoke(app, ["models"])
-    assert told.exit_code == 0
-    assert "MTPCR_GEO_MODELS" in told.output
+    reported = CliRunner().invoke(app, ["models"])
+    assert reported.exit_code == 0
+    assert "MTPCR_GEO_MODELS" in reported.output
 
 
 def test_a_user_adds_a_model_without_code(small_models, tmp_path):
@@ -538,15 +537,15 @@ def test_lightglue_is_not_asked_about_no_keypoints(small_models):
 
 
 def test_one_match_is_refused_by_the_solver():
-    from mtpcr_geo.method.solve import solve_ties
+    from mtpcr_geo.method.solve import solve_tie_points
 
     one = np.zeros((1, 3))
-    with pytest.raises(RegistrationError, match="only 1 ties"):
-        solve_ties(one, one, np.ones(1), np.zeros(1, bool), tolerance=1.0)
+    with pytest.raises(RegistrationError, match="only 1 tie points"):
+        solve_tie_points(one, one, np.ones(1), np.zeros(1, bool), tolerance=1.0)
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         ("title = ", "not TOML"),
         ('title = "x"\nkind = "keypoints"\n[origin]\nproject="p"\nlicence="l"', "takes an .extractor. table"),
@@ -554,9 +553,9 @@ def test_one_match_is_refused_by_the_solver():
         ('title = "x"\nkind = "fused"\nfilename = 3', "filename|fused|origin"),
     ],
 )
-def test_wrong_descriptions_are_named(tmp_path, text, told):
+def test_wrong_descriptions_are_named(tmp_path, text, reported):
     (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(OptionError, match=told) as caught:
+    with pytest.raises(OptionError, match=reported) as caught:
         descriptions(tmp_path)
     assert "mine.toml" in str(caught.value)
 
@@ -581,8 +580,8 @@ def test_extractors_are_deterministic_and_empty_on_nothing(extractor):
 
 def test_errors_reach_the_command_in_one_line(town_files, tmp_path):
     words = ["register", *map(str, town_files), "-o", str(tmp_path / "o"), "--matcher", "xfeat"]
-    told = CliRunner().invoke(app, [*words, "--models", str(tmp_path)])
-    assert told.exit_code == MissingPartError.exit_code
+    reported = CliRunner().invoke(app, [*words, "--models", str(tmp_path)])
+    assert reported.exit_code == MissingPartError.exit_code
     assert issubclass(MissingPartError, MtpcrError)
     assert not (tmp_path / "o").exists()
 
@@ -603,7 +602,7 @@ def test_learned_matchers_on_a_real_pair(name, shared_models, shared_data, tmp_p
         recording=False,
     )
     assert np.degrees(transforms.rotation_angle(result.T_target_source[:3, :3])) < 0.5
-    # ALIKED finds the pose by few ties in one corner: it may be doubted, and says why, but not refused
+    # ALIKED finds the pose by few tie points in one corner: it may be doubted, and says why, but not refused
     assert result.verdict.name in ("accepted", "doubtful")
     assert result.verdict.reasons
 

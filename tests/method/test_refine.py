@@ -7,11 +7,11 @@ from helpers_scene import houses, make_pair
 from mtpcr_geo.benchmark.steps import follow, level_pair
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import RegistrationError
-from mtpcr_geo.core.types import Ties
+from mtpcr_geo.core.types import TiePoints
 from mtpcr_geo.method.icp import FAR_REACH_M, NEAR_REACH_M, Method, Rounds, Surfaces, rounds_for
 from mtpcr_geo.method.overlap import overlap_of
 from mtpcr_geo.method.refine import follow_icp, settle_on_ground
-from mtpcr_geo.verdict.evidence import gather, ties_agreeing
+from mtpcr_geo.verdict.evidence import gather, tie_points_agreeing
 
 
 @pytest.fixture(scope="module")
@@ -96,14 +96,14 @@ def test_reaches_grow_with_coarse_cells_and_end_alike() -> None:
 def test_misfit_is_least_where_surfaces_meet_and_goes_with_the_frame(clouds) -> None:
     source, target = clouds
     surfaces = Surfaces(source, target, np.eye(4))
-    true = surfaces.misfit(np.eye(4))
+    true = surfaces.surface_residual(np.eye(4))
     assert 0.0 < true < 0.1
     for off in (off_by(0.4, (0, 0, 0)), off_by(0.0, (0.3, -0.2, 0.0)), off_by(0.0, (0, 0, 0.15))):
-        assert surfaces.misfit(off) > true + 0.02
-    assert surfaces.misfit(off_by(0.0, (0.0, 0.0, 500.0))) == pytest.approx(1.0, abs=1e-4)
+        assert surfaces.surface_residual(off) > true + 0.02
+    assert surfaces.surface_residual(off_by(0.0, (0.0, 0.0, 500.0))) == pytest.approx(1.0, abs=1e-4)
     turn = off_by(50.0, (3000.0, -2000.0, 100.0))
     elsewhere = Surfaces(source, transforms.apply(turn, target), turn)
-    assert elsewhere.misfit(turn) == pytest.approx(true, abs=0.01)
+    assert elsewhere.surface_residual(turn) == pytest.approx(true, abs=0.01)
 
 
 def grown_fields(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -134,35 +134,35 @@ def test_crops_that_lead_icp_off_the_ground_are_seen_through() -> None:
     led_off = surfaces.descend(start, rounds_for(1.0)["far"]).T
     found = follow_icp(
         surfaces,
-        {"ties": start},
+        {"tie_points": start},
         rounds=rounds_for(1.0),
         agreeing=lambda T: 10,
-        keep_ties=0.5,
+        keep_tie_points=0.5,
     )
     assert off(led_off) > 0.3
     assert off(found.T) < 0.1
     assert not found.report["followed"]
-    assert not found.report["lost_ties"]
+    assert not found.report["lost_tie_points"]
 
 
-@pytest.mark.parametrize("keep_ties", [0.5, 0.0])
-def test_icp_that_loses_the_ties_is_followed_only_where_that_is_asked(clouds, keep_ties: float) -> None:
+@pytest.mark.parametrize("keep_tie_points", [0.5, 0.0])
+def test_icp_that_loses_the_ties_is_followed_only_where_that_is_asked(clouds, keep_tie_points: float) -> None:
     pair = level_pair(*clouds, "none")
     aside = off_by(0.0, (2.2, -1.2, 0.0))
     rng = np.random.default_rng(2)
     place = rng.uniform(-40, 40, (60, 3)) * [1, 1, 0]
-    # ties that agree on a pose from which ICP goes away, to where the clouds fit
-    ties = Ties(
+    # tie points that agree on a pose from which ICP goes away, to where the clouds fit
+    tie_points = TiePoints(
         place, transforms.apply(aside, place), np.ones(60), np.arange(60) % 4, np.arange(60) % 4 == 0,
         np.ones(60, bool),
     )  # fmt: skip
-    pair = pair.with_(ties=ties, T_target_source=aside)
-    step = {"type": "mtpcr.refine", "tag": "refine", "keep_ties": keep_ties}
+    pair = pair.with_(tie_points=tie_points, T_target_source=aside)
+    step = {"type": "mtpcr.refine", "tag": "refine", "keep_tie_points": keep_tie_points}
     refined = follow(pair, [step]).pair
-    followed = keep_ties == 0.0
+    followed = keep_tie_points == 0.0
     assert refined.refine_report["icp"]["followed"] is followed
-    assert refined.refine_report["icp"]["lost_ties"] is not followed
-    assert ties_agreeing(refined, refined.T_target_source) == (0 if followed else 60)
+    assert refined.refine_report["icp"]["lost_tie_points"] is not followed
+    assert tie_points_agreeing(refined, refined.T_target_source) == (0 if followed else 60)
     plan = np.linalg.norm(refined.T_target_source[:2, 3])
     assert plan < 0.05 if followed else plan == pytest.approx(np.hypot(2.2, 1.2), abs=0.05)
 

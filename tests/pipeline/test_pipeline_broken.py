@@ -107,7 +107,7 @@ BROKEN: dict[str, tuple[str | bytes, str, int]] = {
     "out of range": (chain(LEVEL, {"type": "mtpcr.bev", "tag": "bev", "cell": -1}), "greater than 0", 2),
     "wrong choice": (chain({**LEVEL, "method": "ransak"}), "input should be 'auto', 'ransac' or 'none'", 2),
     "missing option": (
-        chain(LEVEL, {"type": "mtpcr.write_ties", "tag": "w"}),
+        chain(LEVEL, {"type": "mtpcr.write_tie_points", "tag": "w"}),
         "option 'filename' is missing",
         2,
     ),

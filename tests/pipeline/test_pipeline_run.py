@@ -137,7 +137,7 @@ def test_crop_count_and_arrays_without_pdal(town_files, monkeypatch):
 
 def test_refused_run_keeps_evidence_and_writes_no_result(town_files, tmp_path):
     stages = build_pipeline(*town_files, tmp_path / "out", RegisterOptions(recording=False))
-    next(stage for stage in stages if stage["type"] == "mtpcr.assess")["surprise"] = 1e9
+    next(stage for stage in stages if stage["type"] == "mtpcr.assess")["neg_log10_p"] = 1e9
     next(stage for stage in stages if stage["type"] == "mtpcr.assess")["margin"] = 1e9
     result = execute(grammar.link(grammar.parse(grammar.dump(stages))))
     written = {path.name for path in files_below(tmp_path)}

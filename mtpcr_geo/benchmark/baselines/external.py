@@ -111,12 +111,12 @@ class External:
         return replace(answer, T_target_source=T, details={"scale": scale})
 
     def _run(self, folder: Path, words: dict[str, str]) -> Estimate:
-        told = folder / "told.txt"
+        reported = folder / "told.txt"
         command = [_filled(word, words) for word in self.description.command]
         limit = self.description.memory_limit_mib
         if limit is not None and os.name == "posix":
             command = [sys.executable, "-c", _LIMITER, str(limit * 2**20), *command]
-        with told.open("wb") as output:
+        with reported.open("wb") as output:
             try:
                 process = subprocess.Popen(
                     command,
@@ -134,7 +134,7 @@ class External:
             reason = f"stopped at the time limit of {self.description.time_limit_s:g} s"
             return Estimate(None, reason=reason, memory_mib=memory)
         if code != 0:
-            return Estimate(None, reason=f"exit code {code}: {_end_of(told)}", memory_mib=memory)
+            return Estimate(None, reason=f"exit code {code}: {_end_of(reported)}", memory_mib=memory)
         try:
             T = read_matrix(Path(words["result"]))
         except (OSError, ValueError) as error:
@@ -232,7 +232,7 @@ def _waited(process: subprocess.Popen[bytes], limit: float) -> tuple[int, float 
             return process.wait(), peak, True
 
 
-def _end_of(told: Path) -> str:
-    lines = told.read_text(encoding="utf-8", errors="replace").split("\n")
+def _end_of(reported: Path) -> str:
+    lines = reported.read_text(encoding="utf-8", errors="replace").split("\n")
     said = [line.strip() for line in lines if line.strip()]
     return said[-1][:300] if said else "it said nothing"

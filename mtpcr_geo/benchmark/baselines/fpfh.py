@@ -58,7 +58,7 @@ def features(xyz: Floats, voxel: float, *, normals: float = 2.0, reach: float = 
 
 
 def mutual_matches(source: Features, target: Features) -> NDArray[np.int64]:
-    """Give (n, 2) numbers of source and target points that are each other's nearest in feature space."""
+    """Return (n, 2) numbers of source and target points that are each other's nearest in feature space."""
     # all against all: trees gain nothing in 33 dimensions, and Open3D's took three times as long
     a, b = (np.asarray(one.fpfh.data, np.float32).T for one in (source, target))
     if not len(a) or not len(b):
@@ -69,7 +69,7 @@ def mutual_matches(source: Features, target: Features) -> NDArray[np.int64]:
 
 
 def _nearest_both_ways(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[Indices, Indices]:
-    """Give each row's nearest in the other array, by blocks of distances that stay in the cache."""
+    """Return each row's nearest in the other array, by blocks of distances that stay in the cache."""
     one_a, one_b = (np.ones((len(x), 1), np.float32) for x in (a, b))
     # -|a - b|^2 / 2 as one product
     long_a = np.hstack([a, one_a * (a * a).sum(axis=1, keepdims=True) / -2, one_a])

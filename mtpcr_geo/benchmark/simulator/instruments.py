@@ -77,7 +77,7 @@ class Scan:
     extra: Table
 
     def part(self, keep: NDArray[np.generic]) -> Scan:
-        """Give the points that a boolean or index array picks."""
+        """Return the points that a boolean or index array picks."""
         return Scan(self.xyz[keep], {name: values[keep] for name, values in self.extra.items()})
 
 

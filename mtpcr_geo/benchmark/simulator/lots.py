@@ -80,7 +80,7 @@ class Layout:
     yards: list[tuple[Frame, float, float, float]] = field(default_factory=list)
 
     def settle(self, frame: Frame, width: float, depth: float) -> Frame:
-        """Give `frame` at the height at which a house would stand there."""
+        """Return `frame` at the height at which a house would stand there."""
         corners = np.array([[x, y, 0] for x in (-0.5, 0, 0.5) for y in (-0.5, 0, 0.5)]) * [width, depth, 1]
         z = self.ground.height(frame.place(corners)[:, :2])
         return Frame(frame.x, frame.y, float(np.quantile(z, 0.6)) + 0.15, frame.yaw)
@@ -101,7 +101,7 @@ class Layout:
             self.plants.append((float(place[0]), float(place[1]), height, int(species)))
 
     def garden_stand(self) -> Plants:
-        """Give the gardens' plants as one stand."""
+        """Return the gardens' plants as one stand."""
         if not self.plants:
             return Plants.empty()
         table = np.array(self.plants)

@@ -148,6 +148,6 @@ class Frame:
         return out
 
     def moved(self, dx: float, dy: float, dz: float = 0.0, turn: float = 0.0) -> Frame:
-        """Give the frame whose origin lies at local (dx, dy, dz), turned by `turn` radians."""
+        """Return the frame whose origin lies at local (dx, dy, dz), turned by `turn` radians."""
         x, y, z = self.place(np.array([dx, dy, dz]))
         return Frame(float(x), float(y), float(z), self.yaw + turn)

@@ -186,7 +186,7 @@ def _check(kind: str, extent_m: float, overlap: float, density: float, ground: s
 
 
 def walk_through(site: Site, yaw: float) -> Floats:
-    """Give the robot's way: through the quarter at the -x end, then on towards the +x end."""
+    """Return the robot's way: through the quarter at the -x end, then on towards the +x end."""
     nodes = site.roads.nodes
     c, s = np.cos(yaw), np.sin(yaw)
     u, v = (nodes @ np.array([[c, -s], [s, c]])).T
@@ -231,7 +231,7 @@ def shared_block(
 
 
 def thinned(xyz: Floats, voxel: float) -> NDArray[np.int64]:
-    """Give the numbers of the first points of each voxel, in their old order."""
+    """Return the numbers of the first points of each voxel, in their old order."""
     if voxel <= 0:
         return np.arange(len(xyz))
     cell = np.floor((xyz - xyz.min(axis=0)) / voxel).astype(np.int64)
@@ -302,7 +302,7 @@ def write_laz(path: Path, cloud: ArrayCloud) -> None:
 
 
 def describe(pair: SimulatedPair, names: tuple[str, str] = ("source.laz", "target.laz")) -> dict[str, Any]:
-    """Give what ``pair.json`` says: CRS, truth, overlap, the two clouds by file name, how it was made."""
+    """Return what ``pair.json`` says: CRS, truth, overlap, the two clouds by file name, how it was made."""
     crs = pair.target.crs
     return {
         "id": pair.name,

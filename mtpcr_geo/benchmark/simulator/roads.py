@@ -52,12 +52,12 @@ class Network:
     widths: Floats
 
     def points(self) -> tuple[Floats, Floats]:
-        """Give all centre-line points (n, 2) and the road's width at each (n,)."""
+        """Return all centre-line points (n, 2) and the road's width at each (n,)."""
         counts = [len(line) for line in self.lines]
         return np.concatenate(self.lines), np.repeat(self.widths, counts)
 
     def lengths(self) -> Floats:
-        """Give the length of each edge in metres: (e,)."""
+        """Return the length of each edge in metres: (e,)."""
         return np.array([np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in self.lines])
 
     def _leg(self, a: int, b: int) -> Floats:

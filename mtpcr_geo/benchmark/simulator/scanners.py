@@ -22,7 +22,7 @@ class HeightAt(Protocol):
     """Gives the ground's height in metres at (n, 2) positions."""
 
     def __call__(self, xy: Floats) -> Floats:
-        """Give (n,) metres."""
+        """Return (n,) metres."""
 
 
 def _drift(time: Floats, size: float, period: float, rng: np.random.Generator) -> Floats:
@@ -37,7 +37,7 @@ def _drift(time: Floats, size: float, period: float, rng: np.random.Generator) -
 
 
 def _along(path: Floats, s: Floats) -> tuple[Floats, Floats]:
-    """Give places (n, 2) at path lengths `s` metres, and headings (n,) in radians."""
+    """Return places (n, 2) at path lengths `s` metres, and headings (n,) in radians."""
     length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))]
     xy = np.stack([np.interp(s, length, path[:, k]) for k in (0, 1)], axis=1)
     before = np.stack([np.interp(s - 1.0, length, path[:, k]) for k in (0, 1)], axis=1)

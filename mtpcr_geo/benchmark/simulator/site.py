@@ -48,7 +48,7 @@ class Site:
     seed: int
 
     def mesh(self, epoch: int, leafiness: float = 1.0) -> Mesh:
-        """Give the site's geometry in one epoch.
+        """Return the site's geometry in one epoch.
 
         Most houses and stems stay; leaves, hedges, crops, parked cars, who passes by, a few trees and a few
         buildings differ.

@@ -65,11 +65,11 @@ class Ground:
         return np.stack([(xy[..., 1] - self.south) / self.cell, (xy[..., 0] - self.west) / self.cell])
 
     def height(self, xy: Floats) -> Floats:
-        """Give the ground's height in metres at (n, 2) positions, bilinear, clamped at the rim."""
+        """Return the ground's height in metres at (n, 2) positions, bilinear, clamped at the rim."""
         return np.asarray(ndimage.map_coordinates(self.z, self._rc(xy), order=1, mode="nearest"))
 
     def cover_at(self, xy: Floats) -> NDArray[np.uint8]:
-        """Give the `Material` at (n, 2) positions."""
+        """Return the `Material` at (n, 2) positions."""
         r, c = np.rint(self._rc(xy)).astype(int)
         top, right = np.array(self.z.shape) - 1
         return np.asarray(self.cover[np.clip(r, 0, top), np.clip(c, 0, right)], np.uint8)

@@ -89,7 +89,7 @@ class Plants:
         )
 
     def aged(self, rng: np.random.Generator, gone: float, growth: float) -> Plants:
-        """Give the stand in another epoch: some felled (share `gone`), the rest grown by about `growth`."""
+        """Return the stand in another epoch: some felled (share `gone`), the rest grown by about `growth`."""
         stay = rng.random(len(self.xy)) >= gone
         n = int(stay.sum())
         return Plants(

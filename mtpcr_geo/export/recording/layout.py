@@ -28,7 +28,7 @@ class Recorded:
     images: dict[str, tuple[int, int]] = field(default_factory=dict)
 
     def has(self, root: str) -> bool:
-        """Whether something was recorded at or below an entity."""
+        """Return whether something was recorded at or below an entity."""
         return any(path == root or path.startswith(root + "/") for path in self.paths)
 
 
@@ -83,7 +83,7 @@ def _overview(recorded: Recorded) -> Any:
     matches = _flat(recorded, "matches", "Matches: source left, target right")
     if not recorded.has("aligned"):
         return rrb.Horizontal(before, *([matches] if matches else []), name="Overview")
-    after = _space(recorded, "aligned", "After: source orange, target blue", hide=("ties", "links"))
+    after = _space(recorded, "aligned", "After: source orange, target blue", hide=("tie_points", "links"))
     below = rrb.Horizontal(before, matches) if matches else before
     return rrb.Vertical(after, below, row_shares=[3, 2], name="Overview")
 
@@ -111,7 +111,7 @@ def _rasters(recorded: Recorded) -> Any:
 def _matches(recorded: Recorded) -> Any:
     import rerun.blueprint as rrb
 
-    matches = _flat(recorded, "matches", "Matches: agreeing green, withheld blue, disagreeing red")
+    matches = _flat(recorded, "matches", "Matches: agreeing green, held out blue, disagreeing red")
     if matches is None:
         return None
     if not recorded.has("hypotheses"):
@@ -156,11 +156,13 @@ def _focus(recorded: Recorded) -> Any:
 def _ties(recorded: Recorded) -> Any:
     import rerun.blueprint as rrb
 
-    if not recorded.has("aligned/ties"):
+    if not recorded.has("aligned/tie_points"):
         return None
-    space = _space(recorded, "aligned", "Ties by misfit: green fits, red does not", hide=("source", "links"))
-    chart = rrb.BarChartView(origin="residuals", name="Ties by misfit in centimetres")
-    return rrb.Vertical(space, chart, row_shares=[3, 1], name="Ties")
+    space = _space(
+        recorded, "aligned", "Tie points by residual: green fits, red does not", hide=("source", "links")
+    )
+    chart = rrb.BarChartView(origin="residuals", name="Tie points by residual in centimetres")
+    return rrb.Vertical(space, chart, row_shares=[3, 1], name="TiePoints")
 
 
 def _inputs(recorded: Recorded) -> Any:
@@ -181,7 +183,7 @@ def _map(recorded: Recorded) -> Any:
 
 
 def _space(recorded: Recorded, origin: str, name: str, hide: tuple[str, ...] = (), away: float = 1.0) -> Any:
-    """Give a 3D view that looks from the south, half from above, at all that is there."""
+    """Return a 3D view that looks from the south, half from above, at all that is there."""
     import rerun.blueprint as rrb
 
     contents = ["$origin/**", *(f"- $origin/{path}/**" for path in hide)]

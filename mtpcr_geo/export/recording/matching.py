@@ -67,13 +67,13 @@ def log_keypoints(pen: Pen, pair: Pair) -> None:
 
 def log_sweep(pen: Pen, pair: Pair) -> None:
     """Log how many matches agreed in every orientation of the source."""
-    told = pair.matches.report if pair.matches is not None else {}
-    turns = told.get("turns_deg")
+    reported = pair.matches.report if pair.matches is not None else {}
+    turns = reported.get("turns_deg")
     if not turns or len(turns) < 2:
         return
     step = 360.0 / len(turns)
     for name in ("agreeing", "matches"):
-        counts = np.array(told[f"turn_{name}"], np.float64)
+        counts = np.array(reported[f"turn_{name}"], np.float64)
         widths = np.full(len(turns), 0.8 * step, np.float32)
         left = np.array(turns, np.float64) - 0.4 * step
         pen.log(f"sweep/{name}", rr.BarChart(counts, abscissa=left, widths=widths, color=drawing.GOOD_RGB))
@@ -85,7 +85,7 @@ def log_focus(pen: Pen, pair: Pair) -> None:
     if matches is None or matches.before_focus is None:
         return
     for name, one in (("before", matches.before_focus), ("after", matches)):
-        bare = pair.with_(matches=one, ties=None, T_target_source=None)
+        bare = pair.with_(matches=one, tie_points=None, T_target_source=None)
         picture, ends, colours, _ = drawing.match_lines(bare)
         pen.image(f"focus/{name}/image", picture)
         at: Floats = (ends + 0.5) * min(1.0, _IMAGE_SIDE / max(picture.shape[:2]))

@@ -22,7 +22,7 @@ from mtpcr_geo.export.tie_points import footprints, tie_positions
 APPLICATION = "mtpcr_geo"
 _ROLE_RGB = {"source": drawing.SOURCE_RGB, "target": drawing.TARGET_RGB}
 _IMAGE_SIDE = 2048
-_KINDS = ("disagreeing", "agreeing", "withheld", "unjudged")
+_KINDS = ("disagreeing", "agreeing", "held_out", "unjudged")
 
 
 class RecordingWriter:
@@ -116,14 +116,14 @@ class RecordingWriter:
             matching.log_keypoints(self._pen, pair)
             matching.log_sweep(self._pen, pair)
             matching.log_focus(self._pen, pair)
-        state = (pair.matches, pair.ties, pair.T_target_source is None)
+        state = (pair.matches, pair.tie_points, pair.T_target_source is None)
         if pair.matches is not None and self._new("matches", state):
             self._log_matches(pair)
         if pair.T_target_source is not None:
             moved = self._new("transform", pair.T_target_source)
             if moved:
                 self._log_aligned(pair)
-            if pair.ties is not None and (self._new("ties", pair.ties) or moved):
+            if pair.tie_points is not None and (self._new("tie_points", pair.tie_points) or moved):
                 self._log_ties(pair)
             if moved and pair.frame.crs is not None:
                 self._log_map(pair)
@@ -220,23 +220,26 @@ class RecordingWriter:
 
     def _log_ties(self, pair: Pair) -> None:
         target, registered = tie_positions(pair)
-        ties = pair.ties
+        tie_points = pair.tie_points
         assert registered is not None
-        assert ties is not None
+        assert tie_points is not None
         if len(target) == 0:
             return
         residual = np.linalg.norm(registered - target, axis=1)
-        colours = drawing.residual_colours(residual, *drawing.residual_limits(residual, ties.inlier))
+        colours = drawing.residual_colours(residual, *drawing.residual_limits(residual, tie_points.inlier))
         points = rr.Points3D(target, colors=colours, radii=rr.Radius.ui_points(5.0))
-        self._log("aligned/ties", points)
+        self._log("aligned/tie_points", points)
         lines = rr.LineStrips3D(
             np.stack([registered, target], axis=1), colors=colours, radii=rr.Radius.ui_points(1.5)
         )
         self._log("aligned/links", lines)
         values = rr.AnyValues(
-            residual_m=residual, score=ties.score, withheld=ties.withheld, inlier=ties.inlier
+            residual_m=residual,
+            score=tie_points.score,
+            held_out=tie_points.held_out,
+            inlier=tie_points.inlier,
         )
-        self._log("aligned/ties", values)
+        self._log("aligned/tie_points", values)
         top = max(float(np.percentile(residual, 95)), 0.05)
         counts, edges = np.histogram(np.clip(residual, 0.0, top), bins=30, range=(0.0, top))
         left_cm = 100.0 * edges[:-1]
@@ -285,7 +288,7 @@ class RecordingWriter:
         self._recorded.paths.add(path)
 
     def _new(self, what: str, value: object) -> bool:
-        """Whether a value differs from the last one of that name; the last is kept alive to compare."""
+        """Return whether a value differs from the last one of that name, which is kept to compare."""
         last = self._seen.get(what)
         if isinstance(value, tuple) and isinstance(last, tuple):
             same = all(a is b for a, b in zip(value, last, strict=True))
@@ -372,8 +375,10 @@ def _made(value: object, before: Pair | None) -> str:
         found.append(f"rasters of {value.target.bev.grid.cell:g} m cells")
     if value.matches is not None and value.matches is not before.matches:
         found.append(f"{len(value.matches.score)} matches")
-    if value.ties is not None and value.ties is not before.ties:
-        found.append(f"{len(value.ties.score)} ties, {int(np.sum(value.ties.inlier))} agreeing")
+    if value.tie_points is not None and value.tie_points is not before.tie_points:
+        found.append(
+            f"{len(value.tie_points.score)} tie points, {int(np.sum(value.tie_points.inlier))} agreeing"
+        )
     if value.T_target_source is not None and value.T_target_source is not before.T_target_source:
         found.append("a transform")
     if value.verdict is not None and value.verdict is not before.verdict:

@@ -129,7 +129,7 @@ def _pictures(pair: Pair) -> str:
         caption = (
             "What was matched: source left, target right. "
             + _key(drawing.GOOD_RGB, "agrees with the transform")
-            + _key(drawing.WITHHELD_RGB, "agrees, and was withheld from the solve")
+            + _key(drawing.WITHHELD_RGB, "agrees, and was held out from the solve")
             + _key(drawing.BAD_RGB, "does not agree")
         )
         if pair.T_target_source is None:
@@ -170,7 +170,7 @@ def _checks(pair: Pair) -> str:
             "proposed. The first was followed; the further it stands out, the surer it is."
             "</figcaption></figure>"
         )
-    if pair.ties is not None and pair.T_target_source is not None and len(pair.ties.target):
+    if pair.tie_points is not None and pair.T_target_source is not None and len(pair.tie_points.target):
         parts += _tie_charts(pair)
     if not parts and not checks:
         return "<p>Nothing to judge by was found.</p>"
@@ -180,19 +180,19 @@ def _checks(pair: Pair) -> str:
 def _tie_charts(pair: Pair) -> list[str]:
     target, registered = tie_positions(pair)
     assert registered is not None
-    assert pair.ties is not None
+    assert pair.tie_points is not None
     residual = np.linalg.norm(registered - target, axis=1)
-    inlier = np.asarray(pair.ties.inlier, bool)
+    inlier = np.asarray(pair.tie_points.inlier, bool)
     good, bad = drawing.residual_limits(residual, inlier)
     limit = max(2.0 * bad, float(np.percentile(residual, 60)) * 1.2, 0.05)
     colours = drawing.residual_colours(residual, good, bad)
     return [
-        f"<figure><h3>Misfit of the ties</h3>{charts.histogram(residual, inlier, limit)}<figcaption>Distance "
-        f"between both ends of each tie after the transform.{_key(drawing.GOOD_RGB, 'agrees')}"
-        f"{_key(drawing.BAD_RGB, 'does not')}</figcaption></figure>",
-        f"<figure><h3>Where they lie</h3>{charts.misfit_map(target, registered, colours, footprints(pair))}"
-        f"<figcaption>Ties in plan, green below {good:g} m of misfit, red from {bad:g} m; lines show its "
-        "direction. Lines that all point one way or turn about a place would mean that the transform is "
+        f"<figure><h3>Residuals of the tie points</h3>{charts.histogram(residual, inlier, limit)}<figcaption>"
+        "Distance between both ends of each tie point after the transform."
+        f"{_key(drawing.GOOD_RGB, 'agrees')}{_key(drawing.BAD_RGB, 'does not')}</figcaption></figure>",
+        f"<figure><h3>Where they lie</h3>{charts.residual_map(target, registered, colours, footprints(pair))}"
+        f"<figcaption>Tie points in plan, green below {good:g} m of residual, red from {bad:g} m; lines show "
+        "its direction. Lines that all point one way or turn about a place would mean that the transform is "
         f"off.{_key(drawing.SOURCE_RGB, 'source')}{_key(drawing.TARGET_RGB, 'target')}</figcaption></figure>",
     ]
 

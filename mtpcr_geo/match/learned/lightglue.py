@@ -38,7 +38,7 @@ class LightGlue:
     def pair(
         self, source: Features, target: Features, shapes: tuple[tuple[int, int], tuple[int, int]]
     ) -> tuple[NDArray[np.int64], Floats]:
-        """Give (m, 2) indices into both, and (m,) scores; shapes are (h, w) of the images.
+        """Return (m, 2) indices into both, and (m,) scores; shapes are (h, w) of the images.
 
         Raises:
             InputError: if the graph gives something else than the contract says.

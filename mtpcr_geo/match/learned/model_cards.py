@@ -124,7 +124,7 @@ class ModelDescription(_Part):
 
 
 def models_folder(given: str | os.PathLike[str] | None) -> Path | None:
-    """Give the folder of model files: the option, else the environment's, else None."""
+    """Return the folder of model files: the option, else the environment's, else None."""
     named = given if given is not None else os.environ.get(VARIABLE)
     return Path(named) if named else None
 
@@ -194,7 +194,7 @@ def inventory(folder: Path | None) -> Iterator[dict[str, Any]]:
 
 
 def sha256(path: Path) -> str:
-    """Give the sha256 of a file, in hexadecimal."""
+    """Return the sha256 of a file, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

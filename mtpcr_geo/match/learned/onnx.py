@@ -202,7 +202,7 @@ class OnnxExtractor:
 
 
 def _threads_allowed() -> int:
-    """Give onnxruntime's number of threads: its own choice, or fewer where the process may use fewer cores.
+    """Return onnxruntime's number of threads: its own choice, or fewer where the process may use fewer cores.
 
     It counts the machine's cores; more threads than it may use spin in each other's way.
     """
@@ -213,7 +213,7 @@ def _threads_allowed() -> int:
 
 
 def filled(image: Grey, empty: int, margin: int) -> tuple[int, int, int, int]:
-    """Give the (top, left, bottom, right) of what is not empty, with a margin; bottom and right excluded.
+    """Return the (top, left, bottom, right) of what is not empty, with a margin; bottom and right excluded.
 
     Args:
         image: (h, w) uint8, not all of it empty.
@@ -268,7 +268,7 @@ def _cores(starts: list[int], tile: int, size: int) -> Iterable[tuple[int, int]]
 
 
 def as_input(image: Grey, channels: int, mean: float, std: float) -> NDArray[np.float32]:
-    """Give a (h, w) uint8 image as (1, channels, h, w) float32: ``(grey / 255 - mean) / std``."""
+    """Return a (h, w) uint8 image as (1, channels, h, w) float32: ``(grey / 255 - mean) / std``."""
     value = (image.astype(np.float32) / 255 - np.float32(mean)) / np.float32(std)
     return np.repeat(value[None, None], channels, axis=1)
 

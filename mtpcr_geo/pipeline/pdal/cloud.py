@@ -79,7 +79,7 @@ class PdalCloud(Cloud):
         _share_metadata(self._steps, metadata)
 
     def records(self) -> list[Records]:
-        """Give all points as structured arrays, in the manner of python-pdal."""
+        """Return all points as structured arrays, in the manner of python-pdal."""
         return self._held if self._held is not None else list(self._stream(self._again, CHUNK_POINTS))
 
     def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[NDArray[np.float64]]:
@@ -187,7 +187,7 @@ def _blamed(stages: Sequence[PdalStage]) -> Iterator[None]:
 
 
 def _stages_of(step: Step) -> Iterator[PdalStage]:
-    """Give every stage of a chain once, inputs first."""
+    """Return every stage of a chain once, inputs first."""
     seen: dict[int, PdalStage] = {}
 
     def visit(at: Step) -> None:
@@ -212,7 +212,7 @@ def _passing_names(stage: PdalStage, context: RunContext) -> dict[str, Any]:
 
 
 def numbered(stage: PdalStage) -> Path | None:
-    """Give the filename of a writer that writes one file a view, a # standing for the number."""
+    """Return the filename of a writer that writes one file a view, a # standing for the number."""
     name = file_of(stage.spec.options)
     return Path(name) if stage.is_writer and name and "#" in name else None
 
@@ -233,7 +233,7 @@ def _spooled(cloud: Cloud, tag: str, context: RunContext) -> dict[str, Any]:
 
 
 def _share_metadata(stages: Sequence[PdalStage], metadata: Any) -> None:
-    """Give each stage its part of PDAL's metadata, which is by type, a list where a type comes twice."""
+    """Return each stage its part of PDAL's metadata, which is by type, a list where a type comes twice."""
     found = json.loads(metadata) if isinstance(metadata, str) else metadata
     by_type = found.get("metadata", {}) if isinstance(found, dict) else {}
     for kind in {stage.spec.type for stage in stages}:

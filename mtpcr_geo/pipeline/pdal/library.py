@@ -50,7 +50,7 @@ class Driver:
 
 
 def available() -> bool:
-    """Whether the `pdal` package can be imported."""
+    """Return whether the `pdal` package can be imported."""
     return importlib.util.find_spec("pdal") is not None
 
 
@@ -123,6 +123,6 @@ def problem_of(stages: Sequence[Mapping[str, Any]]) -> str | None:
 
 
 def first_line(error: BaseException) -> str:
-    """Give the first line of PDAL's message, without a full stop."""
+    """Return the first line of PDAL's message, without a full stop."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[0].rstrip(". ")

@@ -65,12 +65,12 @@ class PdalStage(Stage):
 
     @property
     def is_reader(self) -> bool:
-        """Whether it starts a chain."""
+        """Return whether it starts a chain."""
         return self.spec.type.startswith("readers.")
 
     @property
     def is_writer(self) -> bool:
-        """Whether it leaves a file."""
+        """Return whether it leaves a file."""
         return self.spec.type.startswith("writers.")
 
     def check(self, context: RunContext) -> None:

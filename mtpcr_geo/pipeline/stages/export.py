@@ -32,14 +32,14 @@ class Apply(Stage):
     options: ApplyOptions
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
-        """Give the source's points in the target's CRS and units, streamed on demand."""
+        """Return the source's points in the target's CRS and units, streamed on demand."""
         from mtpcr_geo.io.views import Moved
 
         pair = self.one_pair(inputs)
         if pair.T_target_source is None:
             raise OptionError(f"{self.label} needs a solved pair; put mtpcr.solve before it")
         if refused(pair) and not (self.options.force or context.force):
-            self.metadata["withheld"] = "the verdict is refused"
+            self.metadata["held_out"] = "the verdict is refused"
             return None
         return Moved(pair)
 
@@ -128,24 +128,24 @@ class WriteBev(EvidenceWriter):
         return [pair.target] if pair.source is pair.target else [pair.source, pair.target]
 
 
-class WriteTies(EvidenceWriter):
-    """Write ties, their links, footprints and hypotheses as a GeoPackage."""
+class WriteTiePoints(EvidenceWriter):
+    """Write tie points, their links, footprints and hypotheses as a GeoPackage."""
 
-    type = "mtpcr.write_ties"
+    type = "mtpcr.write_tie_points"
 
     def missing(self, pair: Pair, context: RunContext) -> str | None:
-        """Need ties."""
-        return None if pair.ties is not None else "no ties were found"
+        """Need tie points."""
+        return None if pair.tie_points is not None else "no tie points were found"
 
     def write(self, pair: Pair, context: RunContext) -> None:
         """Write the GeoPackage."""
-        from mtpcr_geo.export.tie_points import write_ties
+        from mtpcr_geo.export.tie_points import write_tie_points
 
-        write_ties(context.outputs.path(self.options.filename), pair)
+        write_tie_points(context.outputs.path(self.options.filename), pair)
 
 
 class WriteTransform(EvidenceWriter):
-    """Write the transform; withheld when the verdict is refused."""
+    """Write the transform; held out when the verdict is refused."""
 
     type: ClassVar[str] = "mtpcr.write_transform"
 
@@ -246,7 +246,7 @@ class WriteRun(EvidenceWriter):
 
 
 def refused(pair: Pair) -> bool:
-    """Whether the verdict is refused."""
+    """Return whether the verdict is refused."""
     return pair.verdict is not None and pair.verdict.name == "refused"
 
 

@@ -61,7 +61,7 @@ class LasReader(Stage):
         self._open()
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
-        """Give the cloud, known by its header."""
+        """Return the cloud, known by its header."""
         cloud = self._open()
         self.metadata |= {
             "filename": str(self.options.filename),
@@ -105,7 +105,7 @@ class CopcReader(LasReader):
     Options = CopcReaderOptions
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
-        """Give the cloud, cropped where bounds are given."""
+        """Return the cloud, cropped where bounds are given."""
         cloud = super().run(inputs, context)
         bounds = self.options.bounds if isinstance(self.options, CopcReaderOptions) else None
         if bounds is None or not isinstance(cloud, Cloud):
@@ -138,7 +138,7 @@ class Crop(Stage):
     options: CropOptions
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
-        """Give the cloud cropped; points stream through."""
+        """Return the cloud cropped; points stream through."""
         return Cropped(one_cloud(self, inputs), self.options.boxes, self.options.outside)
 
 

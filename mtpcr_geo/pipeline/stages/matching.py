@@ -25,7 +25,7 @@ _OF_CORRELATION = {"yaw_step", "patch", "reach", "min_overlap", "prior_sigma"}
 _OF_KEYPOINTS = {
     "models", "turns", "tolerance", "max_keypoints", "tile", "ratio", "cross_check", "device", "threads",
 }  # fmt: skip
-BORNE_TURN_DEG = 22.5
+TOLERATED_ROTATION_DEG = 22.5
 """Turn that every keypoint matcher bears, so that a yaw known as well as that needs no sweep."""
 
 
@@ -144,11 +144,12 @@ class Match(Stage):
         foreign = self.options.model_fields_set & (_OF_KEYPOINTS if correlation else _OF_CORRELATION)
         # words equal to the default say nothing
         fields = type(self.options).model_fields
-        told = sorted(name for name in foreign if getattr(self.options, name) != fields[name].default)
-        if told:
+        reported = sorted(name for name in foreign if getattr(self.options, name) != fields[name].default)
+        if reported:
             kind = "keypoint matchers" if correlation else "correlation"
             raise OptionError(
-                f"{self.label}: option {told[0]!r} is one of {kind}; the method is {self.options.method!r}"
+                f"{self.label}: option {reported[0]!r} is one of {kind}; the method is "
+                f"{self.options.method!r}"
             )
         if not correlation:
             self._matcher = self._make(None)
@@ -167,7 +168,7 @@ class Match(Stage):
         if matcher.needs_image:
             pair = pair.with_(source=_shown(pair.source), target=_shown(pair.target))
         yaw = None
-        if prior is not None and self.options.prior_yaw <= BORNE_TURN_DEG:
+        if prior is not None and self.options.prior_yaw <= TOLERATED_ROTATION_DEG:
             yaw = prior.hypothesis.yaw
         with context.progress.task("searching all yaws" if prior is None else "searching", None) as advance:
             matches = matcher.match(
@@ -270,7 +271,7 @@ class Focus(Stage):
 
 
 def _shown(side: Side) -> Side:
-    """Give the side with an image of its raster, so that what was matched is on record."""
+    """Return the side with an image of its raster, so that what was matched is on record."""
     from mtpcr_geo.method.images import image_of
     from mtpcr_geo.method.paper import grey
 
@@ -283,7 +284,7 @@ def _shown(side: Side) -> Side:
 
 
 def view_of(side: Side, with_image: bool) -> View:
-    """Give what a matcher sees of a side: its raster, and its image where one is wanted."""
+    """Return what a matcher sees of a side: its raster, and its image where one is wanted."""
     from mtpcr_geo.match.base import View
     from mtpcr_geo.method.images import empty_grey
 

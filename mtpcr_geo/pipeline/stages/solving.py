@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 
 def georeference(pair: Pair, label: str) -> Floats:
-    """Give the 4x4 from source to target work coordinates that both CRSs claim.
+    """Return the 4x4 from source to target work coordinates that both CRSs claim.
 
     Raises:
         OptionError: if a cloud has no CRS to claim it by.
@@ -34,7 +34,7 @@ def georeference(pair: Pair, label: str) -> Floats:
 
 
 def bevs_of(stage: Stage, pair: Pair) -> tuple[Bev, Bev]:
-    """Give both rasters, source first.
+    """Return both rasters, source first.
 
     Raises:
         OptionError: if the pair has none, or is one cloud.
@@ -47,12 +47,13 @@ def bevs_of(stage: Stage, pair: Pair) -> tuple[Bev, Bev]:
     return pair.source.bev, pair.target.bev
 
 
-class LiftOptions(StageOptions):
-    """Options of mtpcr.lift."""
+class InverseMappingOptions(StageOptions):
+    """Options of mtpcr.inverse_mapping."""
 
     surface: Literal["ground", "top", "grey"] = Field(
         "ground",
-        description="height of a tie: the lowest z around it, the highest z of its cell, or that in 255 "
+        description="height of a tie point: the lowest z around it, the highest z of its cell, or that in "
+        "255 "
         "steps (the paper's Eq. 5)",
     )
     pixel: Literal["centre", "ceil"] = Field(
@@ -63,28 +64,30 @@ class LiftOptions(StageOptions):
         4,
         ge=2,
         le=20,
-        description="parts of the ties' ground; the first is withheld from the solve to judge it by",
+        description="parts of the tie points' ground; the first is held out from the solve to judge it by",
     )
-    block: float = Field(40.0, gt=0, description="edge of the blocks in which ties are withheld, metres")
-    seed: int = Field(0, ge=0, description="seed that chooses the withheld blocks")
+    block: float = Field(
+        40.0, gt=0, description="edge of the blocks in which tie points are held out, metres"
+    )
+    seed: int = Field(0, ge=0, description="seed that chooses the held out blocks")
 
 
-class Lift(Stage):
+class InverseMapping(Stage):
     """Map matches back to 3D in metres (Eq. 5), and set some aside to judge by."""
 
-    type: ClassVar[str] = "mtpcr.lift"
-    Options: ClassVar[OptionsModel] = LiftOptions
-    options: LiftOptions
+    type: ClassVar[str] = "mtpcr.inverse_mapping"
+    Options: ClassVar[OptionsModel] = InverseMappingOptions
+    options: InverseMappingOptions
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
-        """Lift the matches to ties."""
-        from mtpcr_geo.method.inverse_mapping import lift
+        """Lift the matches to tie points."""
+        from mtpcr_geo.method.inverse_mapping import inverse_mapping
 
         pair = self.one_pair(inputs)
         source, target = bevs_of(self, pair)
         if pair.matches is None:
             raise OptionError(f"{self.label} needs matches; put mtpcr.match before it")
-        ties = lift(
+        tie_points = inverse_mapping(
             pair.matches,
             source,
             target,
@@ -94,31 +97,34 @@ class Lift(Stage):
             block_m=self.options.block,
             seed=self.options.seed,
         )
-        self.metadata |= {"ties": len(ties.score), "withheld": int(ties.withheld.sum())}
-        return pair.with_(ties=ties)
+        self.metadata |= {"tie_points": len(tie_points.score), "held_out": int(tie_points.held_out.sum())}
+        return pair.with_(tie_points=tie_points)
 
 
 class SolveOptions(StageOptions):
     """Options of mtpcr.solve."""
 
     tolerance: float | None = Field(
-        None, gt=0, description="plan residual up to which ties agree, metres; 1.5 cells if not given"
+        None, gt=0, description="plan residual up to which tie points agree, metres; 1.5 cells if not given"
     )
     upright: bool = Field(
         True, description="solve yaw and shift, trusting the levelling; else all six degrees of freedom"
     )
     robust_start: bool = Field(
         True,
-        description="start from the yaw and shift most ties agree on (RANSAC); else from all (the paper)",
+        description="start from the yaw and shift most tie points agree on (RANSAC); else from all (the "
+        "paper)",
     )
     tries: int = Field(
-        2000, ge=1, description="pairs of ties tried for the robust start; more where few of them are right"
+        2000,
+        ge=1,
+        description="pairs of tie points tried for the robust start; more where few of them are right",
     )
     seed: int = Field(0, ge=0, description="seed of the robust start")
 
 
 class Solve(Stage):
-    """Solve the rigid transform from the ties: iterative SVD with outlier rejection."""
+    """Solve the rigid transform from the tie points: iterative SVD with outlier rejection."""
 
     type: ClassVar[str] = "mtpcr.solve"
     Options: ClassVar[OptionsModel] = SolveOptions
@@ -126,19 +132,19 @@ class Solve(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Solve in levelled coordinates, and compose both levelling rotations into the result."""
-        from mtpcr_geo.method.solve import solve_ties
+        from mtpcr_geo.method.solve import solve_tie_points
 
         pair = self.one_pair(inputs)
         bevs_of(self, pair)
-        if pair.ties is None:
-            raise OptionError(f"{self.label} needs ties; put mtpcr.lift before it")
-        ties = pair.ties
+        if pair.tie_points is None:
+            raise OptionError(f"{self.label} needs tie points; put mtpcr.inverse_mapping before it")
+        tie_points = pair.tie_points
         tolerance = self.options.tolerance or 1.5 * pair.cell
-        solution, inlier = solve_ties(
-            ties.source,
-            ties.target,
-            ties.score,
-            ties.withheld,
+        solution, inlier = solve_tie_points(
+            tie_points.source,
+            tie_points.target,
+            tie_points.score,
+            tie_points.held_out,
             tolerance=tolerance,
             robust_start=self.options.robust_start,
             upright=self.options.upright,
@@ -148,7 +154,7 @@ class Solve(Stage):
         T_work_level = transforms.inverse(pair.target.T_level_work)
         T = T_work_level @ solution.T @ pair.source.T_level_work
         report = {
-            "used": int((~ties.withheld).sum()),
+            "used": int((~tie_points.held_out).sum()),
             "inliers": int(solution.inlier.sum()),
             "iterations": solution.iterations,
             "threshold_m": solution.threshold,
@@ -161,7 +167,9 @@ class Solve(Stage):
             },
         }
         self.metadata |= report
-        return pair.with_(T_target_source=T, ties=replace(ties, inlier=inlier), solve_report=report)
+        return pair.with_(
+            T_target_source=T, tie_points=replace(tie_points, inlier=inlier), solve_report=report
+        )
 
 
 class RefineOptions(StageOptions):
@@ -187,11 +195,12 @@ class RefineOptions(StageOptions):
         "rigid", description="degrees of freedom of the result: all six, yaw and shift, or the shift alone"
     )
     ground: bool = Field(True, description="settle height and tilt on the ground before, and height after")
-    keep_ties: float = Field(
+    keep_tie_points: float = Field(
         0.5,
         ge=0,
         le=1,
-        description="share of the agreeing ties that must still agree after ICP for it to be followed; on "
+        description="share of the agreeing tie points that must still agree after ICP for it to be "
+        "followed; on "
         "open ground it may slide. 0 to follow it always, however the surfaces fit",
     )
 
@@ -207,14 +216,14 @@ class Refine(Stage):
         """Refine the solved transform."""
         from mtpcr_geo.method.icp import Rounds, Surfaces, rounds_for
         from mtpcr_geo.method.refine import beyond_scatter, constrain, follow_icp, settle_on_ground
-        from mtpcr_geo.verdict.evidence import ties_agreeing
+        from mtpcr_geo.verdict.evidence import tie_points_agreeing
 
         pair = self.one_pair(inputs)
         if pair.T_target_source is None:
             raise OptionError(f"{self.label} needs a transform; put mtpcr.solve before it")
         source, target, T = pair.source.sample, pair.target.sample, pair.T_target_source
         report: dict[str, object] = {}
-        starts = {"ties": T}
+        starts = {"tie_points": T}
         if self.options.ground:
             settled = settle_on_ground(source, target, T, tilt=True)
             T, report["ground_before"] = settled.T, settled.report
@@ -228,14 +237,14 @@ class Refine(Stage):
                 T,
                 voxel_m=self.options.voxel,
                 reach_m=max(max(one.reach_m) for one in rounds.values()),
-                most_points=self.options.max_points,
+                max_points=self.options.max_points,
             )
             refined = follow_icp(
                 surfaces,
                 starts,
                 rounds=rounds,
-                agreeing=lambda T: ties_agreeing(pair, T),
-                keep_ties=self.options.keep_ties,
+                agreeing=lambda T: tie_points_agreeing(pair, T),
+                keep_tie_points=self.options.keep_tie_points,
                 method=self.options.method,
                 iterations=self.options.iterations,
             )
@@ -245,9 +254,9 @@ class Refine(Stage):
             followed = self.options.method == "none" or beyond_scatter(settled)
             report["ground_after"] = {**settled.report, "followed": followed}
             T = settled.T if followed else T
-        if self.options.motion != "rigid" and pair.ties is not None:
+        if self.options.motion != "rigid" and pair.tie_points is not None:
             T_work_level = transforms.inverse(pair.source.T_level_work)
-            pivot = transforms.apply(T_work_level, pair.ties.source.mean(axis=0, keepdims=True))[0]
+            pivot = transforms.apply(T_work_level, pair.tie_points.source.mean(axis=0, keepdims=True))[0]
             upright = transforms.inverse(pair.target.T_level_work)[:3, :3] @ pair.source.T_level_work[:3, :3]
             T = constrain(T, self.options.motion, pivot, upright)
         self.metadata |= report
@@ -260,16 +269,21 @@ class AssessOptions(StageOptions):
     tolerance: float | None = Field(
         None,
         gt=0,
-        description="plan distance within which a withheld tie agrees, metres; if not given one cell, or two "
+        description="plan distance within which a held-out tie point agrees, metres; if not given one cell, "
+        "or two "
         "for keypoint matchers",
     )
-    surprise: float = Field(
-        6.0, ge=0, description="digits of improbability of the withheld ties' agreement wanted to accept"
+    neg_log10_p: float = Field(
+        6.0,
+        ge=0,
+        description="digits of improbability of the held-out tie points' agreement wanted to accept",
     )
     margin: float = Field(
         1.3, ge=1, description="strength over the next distinct hypothesis wanted to accept"
     )
-    agreeing: float = Field(0.15, ge=0, le=1, description="share of withheld ties that must agree to accept")
+    agreeing: float = Field(
+        0.15, ge=0, le=1, description="share of held-out tie points that must agree to accept"
+    )
     min_overlap: float = Field(400.0, ge=0, description="overlap wanted to accept, square metres")
 
 
@@ -286,13 +300,13 @@ class Assess(Stage):
         from mtpcr_geo.verdict.evidence import gather
 
         pair = self.one_pair(inputs)
-        if pair.T_target_source is None or pair.ties is None:
-            raise OptionError(f"{self.label} needs a transform and ties; put mtpcr.solve before it")
+        if pair.T_target_source is None or pair.tie_points is None:
+            raise OptionError(f"{self.label} needs a transform and tie points; put mtpcr.solve before it")
         options = self.options
         pair = self._no_worse_than_prior(pair)
         evidence, more = gather(pair, options.tolerance)
         limits = Limits(
-            surprise=options.surprise,
+            neg_log10_p=options.neg_log10_p,
             agreeing=options.agreeing,
             margin=options.margin,
             overlap_m2=options.min_overlap,
@@ -302,7 +316,7 @@ class Assess(Stage):
         return pair.with_(verdict=verdict)
 
     def _no_worse_than_prior(self, pair: Pair) -> Pair:
-        """Keep the transform known beforehand where more ties and as much ground agree with it."""
+        """Keep the transform known beforehand where more tie points and as much ground agree with it."""
         from mtpcr_geo.verdict.evidence import agreement
 
         if pair.T_prior is None or pair.T_target_source is None:
