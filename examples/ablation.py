@@ -25,6 +25,7 @@ from mtpcr_geo.benchmark.pairs import BenchmarkPair, load_pair, pair_folders
 from mtpcr_geo.benchmark.steps import follow, level_pair, random_start, steps_of
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import MtpcrError
+from mtpcr_geo.crs.chain import TransformChain
 
 
 def main() -> None:
@@ -74,7 +75,7 @@ def ablated(pair: BenchmarkPair, options: argparse.Namespace) -> str:
                 if step["type"] == "mtpcr.enhance" and options.band_pass and enhance:
                     step["look"] = "band_pass"
             done = follow(levelled, steps)
-            T = done.pair.T_file if done.pair.T_target_source is not None else None
+            T = TransformChain.of(done.pair).T_file if done.pair.T_target_source is not None else None
             found = done.pair.matches.report if done.pair.matches is not None else {}
             row: dict[str, Any] = {
                 "right": False,

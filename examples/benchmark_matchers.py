@@ -26,6 +26,7 @@ from mtpcr_geo.benchmark.pairs import load_pair, pair_folders
 from mtpcr_geo.benchmark.steps import follow, level_pair, random_start, steps_of
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import MtpcrError
+from mtpcr_geo.crs.chain import TransformChain
 
 FIELDS = (
     "pair", "seed", "tilt_deg", "start", "matcher", "image", "verdict", "right", "rotation_deg", "distance_m",
@@ -130,7 +131,11 @@ def runs(
                 if look != "-":
                     steps = [{"type": "mtpcr.enhance", "tag": "enhance", "look": look}, *steps]
                 outcome = follow(rasters[str(raster)], steps)
-                T = outcome.pair.T_file if outcome.pair.T_target_source is not None else None
+                T = (
+                    TransformChain.of(outcome.pair).T_file
+                    if outcome.pair.T_target_source is not None
+                    else None
+                )
                 row = {
                     "pair": name, "seed": options.seed, "tilt_deg": options.tilt, "start": start,
                     "matcher": matcher, "image": look,

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.types import Floats, Pair, Verdict
+from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.pipeline import grammar
 from mtpcr_geo.pipeline.options import OUTPUT_NAMES, RegisterOptions
 from mtpcr_geo.pipeline.registry import first_problem
@@ -116,7 +117,7 @@ def registration_of(result: RunResult) -> Registration:
     """Gather what a registering pipeline came to."""
     verdict = result.verdict or Verdict("refused", ("the pipeline judged nothing",), {})
     pair = result.pair
-    T = pair.T_file if pair is not None and pair.T_target_source is not None else None
+    T = TransformChain.of(pair).T_file if pair is not None and pair.T_target_source is not None else None
     names = {path.name: name for name, path in OUTPUT_NAMES.items()}
     names |= {f"{role}.tif": f"bev_{role}" for role in ("source", "target", "registered")}
     outputs = {names.get(path.name, path.stem): path for path in result.outputs}

@@ -14,6 +14,7 @@ from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.progress import NoProgress
 from mtpcr_geo.core.types import Pair
+from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.pipeline.registry import make_options, stage_types
 from mtpcr_geo.pipeline.stage import RunContext, Stage, Value
@@ -50,7 +51,7 @@ class Ours:
         pair = value[0]
         assert isinstance(pair, Pair)
         assert pair.verdict is not None
-        T = pair.T_file if pair.T_target_source is not None else None
+        T = TransformChain.of(pair).T_file if pair.T_target_source is not None else None
         numbers = {
             key: float(number)
             for key, number in pair.verdict.metrics.items()

@@ -13,11 +13,12 @@ from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.grid import Grid
 
 if TYPE_CHECKING:
-    from mtpcr_geo.crs import FrameLink, WorkFrame
-    from mtpcr_geo.method.images import Look
+    from mtpcr_geo.core.frames import FrameLink, WorkFrame
 
 Floats = NDArray[np.float64]
 VerdictName = Literal["accepted", "doubtful", "refused"]
+Look = Literal["band_pass", "paper", "paper_normalised", "grey", "grey_printed"]
+"""How the image of a raster is made that keypoint matchers see, see `mtpcr_geo.method.images.image_of`."""
 
 
 @dataclass(frozen=True)
@@ -202,19 +203,3 @@ class Pair:
     def with_(self, **changes: Any) -> Pair:
         """Copy with some fields replaced."""
         return replace(self, **changes)
-
-    @property
-    def T_file(self) -> Floats:
-        """4x4 on the coordinates as they stand in the files: source file -> target file.
-
-        Where a change of CRS makes the way no 4x4, this is the nearest one over the source.
-
-        Raises:
-            ValueError: if the pair is not solved yet.
-
-        """
-        if self.T_target_source is None:
-            raise ValueError("the pair has no transform yet")
-        from mtpcr_geo.crs import TransformChain
-
-        return TransformChain.of(self).T_file

@@ -8,18 +8,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, get_args
+from typing import get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo.core.types import Bev
+from mtpcr_geo.core.types import Bev, Look
 from mtpcr_geo.method import paper
 
 Image = NDArray[np.float32]
 Grey = NDArray[np.uint8]
-Look = Literal["band_pass", "paper", "paper_normalised", "grey", "grey_printed"]
 LOOKS: tuple[Look, ...] = get_args(Look)
 
 EMPTY_GREY = 127

@@ -63,8 +63,8 @@ def follow_icp(
         starts: 4x4 from source to target work coordinates by name; ICP starts from the last.
         rounds: the runs of ICP to try, by name.
         agreeing: counts the tie points that a transform brings together.
-        keep_tie_points: share of the tie points agreeing at the last start that must still agree; 0 follows ICP
-            always.
+        keep_tie_points: share of the tie points agreeing at the last start that must still agree; 0
+            follows ICP always.
         method: of `Surfaces.descend`.
         iterations: at most, each round.
 

@@ -17,6 +17,7 @@ from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev
 from mtpcr_geo.crs import FrameLink, WorkFrame
+from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.export import geotiff, tie_points
 from mtpcr_geo.export.geopackage import Layer, blob, write_geopackage
 
@@ -155,7 +156,7 @@ def test_ties_open_in_gdal_where_they_belong(tmp_path):
     assert table["held_out"].sum() == 16
     assert table["inlier"].dtype == bool
     source = np.column_stack([table["source_x"], table["source_y"], table["source_z"]])
-    moved = transforms.apply(pair.T_file, source)
+    moved = transforms.apply(TransformChain.of(pair).T_file, source)
     assert np.allclose(np.linalg.norm(moved - xyz, axis=1), table["residual_m"])
     info, _, _, fields = pyogrio.raw.read(tmp_path / "t.gpkg", layer="footprints")
     assert info["crs"] == "EPSG:25833"

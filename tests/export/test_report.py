@@ -13,6 +13,7 @@ from helpers_scene import ICP_REPORT, make_pair, rasterise
 
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.types import Verdict
+from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.export import charts, descriptions, drawing
 from mtpcr_geo.export.report.page import write_report
 
@@ -85,13 +86,13 @@ def test_it_tells_what_where_and_how_sure(tmp_path):
         assert text in html
     assert "some/where" not in html
     numbers = re.search(r"<pre>(.*?)</pre>", html, re.DOTALL).group(1).split()
-    assert np.array_equal(np.array(numbers, float).reshape(4, 4), pair.T_file)
+    assert np.array_equal(np.array(numbers, float).reshape(4, 4), TransformChain.of(pair).T_file)
 
 
 def test_the_worked_example_agrees_with_the_matrix():
     pair = make_pair(1000)
     before, after = descriptions.worked_example(pair)
-    assert np.allclose((pair.T_file @ [*before, 1.0])[:3], after, atol=1e-6)
+    assert np.allclose((TransformChain.of(pair).T_file @ [*before, 1.0])[:3], after, atol=1e-6)
 
 
 @pytest.mark.parametrize("state", ["levelled", "matched", "tied", "solved"])

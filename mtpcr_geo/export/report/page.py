@@ -209,7 +209,7 @@ def _transform(pair: Pair) -> str:
         f"<p>Takes source coordinates (x, y, z, 1) in {escape(start)}: "
         f"{escape(descriptions.units_text(source))}, "
         f"to {escape(descriptions.result_text(pair))}.{exact}</p>",
-        f"<pre>{descriptions.matrix_text(pair.T_file)}</pre>",
+        f"<pre>{descriptions.matrix_text(TransformChain.of(pair).T_file)}</pre>",
     ]
     example = descriptions.worked_example(pair)
     if example is not None:

@@ -13,6 +13,7 @@ from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.recorder import NullRecorder
 from mtpcr_geo.core.system import peak_memory_mb
 from mtpcr_geo.core.types import Pair, Side, Verdict
+from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.pipeline.stage import RunContext, Stage, StageOptions, Value
 
 TransformFormat = Literal["json", "cloudcompare", "pdal"]
@@ -263,7 +264,9 @@ def run_facts(pair: Pair | None, context: RunContext) -> dict[str, Any]:
         "reasons": list(verdict.reasons) if verdict else [],
         "metrics": verdict.metrics if verdict else {},
         # found, which says nothing of whether to use it: that is the verdict
-        "T_target_source": pair.T_file if pair is not None and pair.T_target_source is not None else None,
+        "T_target_source": TransformChain.of(pair).T_file
+        if pair is not None and pair.T_target_source is not None
+        else None,
         "frames": frames_of(pair) if pair is not None else None,
         "time_s": {**seconds, "total": round(time.perf_counter() - context.facts["started"], 4)},
         "peak_memory_mb": peak_memory_mb(),

@@ -12,8 +12,7 @@ from pydantic import Field
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.core.types import Appearance, Bev, Pair, Side
-from mtpcr_geo.method.images import Look
+from mtpcr_geo.core.types import Appearance, Bev, Look, Pair, Side
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 from mtpcr_geo.pipeline.stages.solving import bevs_of, georeference
 
