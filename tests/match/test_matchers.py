@@ -204,7 +204,7 @@ def test_descriptors_find_the_yaw_of_a_town(name):
     pair = make_pair(60_000, state="levelled")
     found = matcher(name).match(*views(pair))
     assert found.hypotheses[0].yaw == pytest.approx(YAW, abs=np.radians(2.0))
-    assert found.report["margin"] > 1.3
+    assert found.margin > 1.3
     again = matcher(name).match(*views(pair))
     np.testing.assert_array_equal(found.source_px, again.source_px)
 
