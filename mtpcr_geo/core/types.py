@@ -184,6 +184,7 @@ class Matches(ComparesArrays):
             matchers that search the whole raster.
         margin: strength of the best hypothesis over the next distinct one; None where there is no telling.
         support: share of the patches in the overlap that agree on the pose; None likewise.
+        null_ratio: strength of the best hypothesis over the best of the mirrored source; None likewise.
         report: further figures of the matcher, for the audit only.
         source_keypoints, target_keypoints: (k, 2) pixels of all keypoints, matched or not; None from
             matchers that have none.
@@ -199,6 +200,7 @@ class Matches(ComparesArrays):
     search_radius_m: float | None = None
     margin: float | None = None
     support: float | None = None
+    null_ratio: float | None = None
     report: Mapping[str, Any] = field(default_factory=dict)
     source_keypoints: Floats | None = None
     target_keypoints: Floats | None = None

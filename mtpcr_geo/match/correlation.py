@@ -1,8 +1,10 @@
 """The default matcher: a global search by correlation, judged at fine cells, then local patch matches.
 
-The search works coarse to fine. A level proposes hypotheses; each is followed down to the finest cells and
-scored there, in one common way. Where the best stands clearly above the next distinct one and its patches
-agree with each other, the search ends; else the next finer level is searched.
+The search works coarse to fine. A level proposes hypotheses, from height and step edges and from the terrain;
+each is followed down to the finest cells and judged there, in one common way, before any is dropped. Where
+the best stands clearly above the next distinct one and its patches agree with each other, the search ends;
+else the next finer level is searched. The same search of the mirrored source, which has no right pose, tells
+what chance and self-similarity score on this pair.
 """
 
 from __future__ import annotations
@@ -14,32 +16,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Mask
 from mtpcr_geo.core.errors import RegistrationError
+from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.statistics import chance_within, neg_log10_p
 from mtpcr_geo.core.types import Bev, Hypothesis, Matches
 from mtpcr_geo.match.base import margin_of
 from mtpcr_geo.match.patches import PatchMatches, match_patches
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.search import GlobalSearch, Layer, angle_between, distinct, score_nearby
+from mtpcr_geo.match.terrain import FEWEST_CELLS as FEWEST_GROUND_CELLS
+from mtpcr_geo.match.terrain import GroundComparison, Terrain, TerrainSearch, compare_ground, place_on
 from mtpcr_geo.method.bev import coarsen
 from mtpcr_geo.method.images import channels
+from mtpcr_geo.method.scales import Scales, scales_of
 from mtpcr_geo.method.solve import iterative_svd, ransac_upright
 
-SEARCH_CELLS_M = (8.0, 4.0, 2.0)
+COARSEST_SEARCH_M = 8.0
+FEWEST_ACROSS = 40
+"""Cells along the smaller raster's longer side that the coarsest level of the search leaves at least."""
 LARGEST_SEARCH = 420
 """Cells along a raster's side up to which a level is searched over all yaws in about two seconds."""
+LEVELS = 3
+COARSEST_YAW_STEP_DEG, FINEST_YAW_STEP_DEG = 4.0, 2.0
+FEWEST_OVERLAP_CELLS = 20
 PEAKS_A_YAW = 3
-HYPOTHESES = 10
-DROPPED_BELOW = 0.5
-"""Share of the best score below which a hypothesis is not followed further."""
+HYPOTHESES = 12
+TERRAIN_HYPOTHESES = 6
+DROPPED_BELOW = 0.4
+"""Share of the best score at fine cells below which a hypothesis is not judged by patches."""
 RADIUS_CELLS = 4
 """How far the final patch matches may lie from where the pose puts them, cells."""
 AGREE_CELLS = 1.5
+MAX_RADIUS_CELLS = 8
+SAME_YAW_DEG = 5.0
+GROUND_SCALE_M = 0.1
+"""Spread of the ground's height differences, beyond the least of all hypotheses, that halves a strength."""
 
 
 @dataclass(frozen=True)
 class CorrelationSettings:
-    """What governs the search.
+    """What governs the search; lengths that are None follow from the data, see `mtpcr_geo.method.scales`.
 
     Attributes:
         yaw_step_deg: step of the search over all yaws.
@@ -47,19 +64,26 @@ class CorrelationSettings:
         search_radius_m: how far a patch may lie from where the hypothesis puts it, metres.
         min_overlap_m2: smallest overlap considered, square metres.
         min_overlap_share: smallest overlap considered, as a share of the smaller raster.
-        convincing_margin: best over next distinct score at fine cells that ends the search.
-        convincing_surprise: digits of improbability of its patches' agreement that end it. Streets that run
-            alike have given 11 digits to a pose 120 m off, where the true one had 48.
+        convincing_margin: best over next distinct strength that ends the search.
+        convincing_neg_log10_p: significance of its patches' agreement that ends it. Streets that run
+            alike have given 11 to a pose 120 m off, where the true one had 48.
+        mirrored_null: search the mirrored source too.
+        trust_vertical: whether both verticals are known, so that the terrains may differ by a shift alone.
 
     """
 
-    yaw_step_deg: float = 4.0
-    patch_m: float = 24.0
-    search_radius_m: float = 6.0
-    min_overlap_m2: float = 400.0
+    yaw_step_deg: float | None = None
+    patch_m: float | None = None
+    search_radius_m: float | None = None
+    min_overlap_m2: float | None = None
     min_overlap_share: float = 0.03
     convincing_margin: float = 1.5
     convincing_neg_log10_p: float = 20.0
+    mirrored_null: bool = True
+    trust_vertical: bool = True
+
+
+DEFAULTS = CorrelationSettings()
 
 
 @dataclass(frozen=True)
@@ -89,16 +113,16 @@ class Candidate:
 
     Attributes:
         pose: about the fine source raster's centre, with its score there.
-        proposed: score at the level that proposed it.
         patches: local matches under it, where it was judged by them.
         supporting: (n,) patches that agree on one pose.
+        ground: how the shapes of both grounds compare under it.
 
     """
 
     pose: Pose
-    proposed: float
     patches: PatchMatches | None = None
-    supporting: NDArray[np.bool_] | None = None
+    supporting: Mask | None = None
+    ground: GroundComparison | None = None
 
     @property
     def support(self) -> float:
@@ -109,7 +133,7 @@ class Candidate:
 
     @property
     def neg_log10_p(self) -> float:
-        """Digits of improbability that so many of the patches matched agree by chance."""
+        """Minus log10 of the probability that so many of the matched patches agree by chance."""
         if self.patches is None or self.supporting is None:
             return 0.0
         agreeing = max(int(self.supporting.sum()) - 2, 0)
@@ -117,17 +141,56 @@ class Candidate:
 
     @property
     def strength(self) -> float:
-        """Score times support: what hypotheses are ranked by.
+        """Score times support: what hypotheses are ranked by, before the ground is asked.
 
         Repetitive scenes give high scores to wrong poses with a large overlap; their patches disagree.
         """
         return self.pose.score * self.support
 
 
+@dataclass(frozen=True)
+class Pool:
+    """Judged hypotheses, best first.
+
+    Attributes:
+        candidates: the hypotheses.
+        strengths: of each: score times support, times how well the ground agrees.
+
+    """
+
+    candidates: tuple[Candidate, ...] = ()
+    strengths: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, candidates: Sequence[Candidate], same_pose_m: float) -> Pool:
+        """Rank candidates by strength and the ground, and join those that came down to the same place."""
+        known = [c.ground.spread_m for c in candidates if c.ground is not None and c.ground.known]
+        least = min(known, default=0.0)
+        weighed = [(c.strength * _ground_factor(c.ground, least), c) for c in candidates]
+        weighed.sort(key=lambda one: (-one[0], -one[1].pose.score))
+        kept: list[tuple[float, Candidate]] = []
+        for strength, candidate in weighed:
+            if not any(_same(candidate.pose, other.pose, same_pose_m) for _, other in kept):
+                kept.append((strength, candidate))
+        return cls(tuple(c for _, c in kept), tuple(s for s, _ in kept))
+
+    @property
+    def margin(self) -> float:
+        """Strength of the best over that of the next distinct hypothesis."""
+        return margin_of(self.strengths)
+
+
+def _ground_factor(ground: GroundComparison | None, least_m: float) -> float:
+    """Return 1 where the grounds agree as well as they do anywhere, less where they differ in shape."""
+    if ground is None or not ground.known:
+        return 0.5
+    return 1.0 / (1.0 + (ground.spread_m / (GROUND_SCALE_M + least_m)) ** 2)
+
+
 def match(
     source: Bev,
     target: Bev,
-    settings: CorrelationSettings,
+    settings: CorrelationSettings = DEFAULTS,
     seed: int = 0,
     advance: Callable[[int], object] = lambda n: None,
     prior: Prior | None = None,
@@ -148,181 +211,276 @@ def match(
         RegistrationError: if the rasters are too small or too empty to overlap enough.
 
     """
-    pyramid = Pyramid(source, target)
-    pool: list[Candidate] = []
-    searched = []
-    for factor in search_factors(source, target):
-        found = _search(pyramid, factor, settings, advance, prior)
-        searched.append({"cell_m": source.grid.cell * factor, "scores": [round(p.score, 3) for p in found]})
-        pool = _distinct([*pool, *(_descend(pyramid, factor, pose) for pose in found)])
-        pool = _distinct([_score_patches(pyramid, c, settings, seed) for c in _worth_judging(pool)])
-        if (
-            pool
-            and _margin(pool) >= settings.convincing_margin
-            and pool[0].neg_log10_p >= settings.convincing_neg_log10_p
-        ):
-            break
-    if not pool:
+    scales = scales_of(source, target)
+    search = _Search(source, target, scales, settings, seed, advance)
+    pool, searched = search.explore(prior)
+    if not pool.candidates:
         raise RegistrationError(
             "no pose brings the two rasters to overlap enough to compare; the clouds may be too small or too "
             f"sparse for cells of {source.grid.cell:g} m: give a finer --cell, or larger clouds"
         )
-    best = pool[0]
-    matches = best.patches
-    assert matches is not None  # the best hypotheses are always judged by patches
+    mirrored = None
+    if settings.mirrored_null and prior is None:
+        twin = _Search(mirror(source), target, scales, settings, seed, advance, search.pyramid)
+        mirrored, _ = twin.explore(None, [level.factor for level in searched])
+    best = pool.candidates[0]
+    patches = best.patches
+    assert patches is not None  # hypotheses in a pool are judged by patches
     pivot = centre_of(source.grid)
-    margin = _margin(pool)
     radius = (RADIUS_CELLS - 0.5) * source.grid.cell
+    null_ratio = None
+    if mirrored is not None:
+        strongest = max((c.strength for c in mirrored.candidates), default=0.0)
+        null_ratio = margin_of([best.strength, strongest], floor=1e-6)
     report = {
         "cell_m": source.grid.cell,
+        "extent_m": scales.extent_m,
+        "patch_m": scales.patch_m if settings.patch_m is None else settings.patch_m,
         "search_radius_m": radius,
-        "searched": searched,
-        "margin": margin,
+        "searched": [{"cell_m": level.cell_m, "scores": list(level.scores)} for level in searched],
+        "margin": pool.margin,
         "support": best.support,
         "neg_log10_p": best.neg_log10_p,
-        "support_next": max((c.support for c in pool[1:]), default=0.0),
-        "patches": matches.patches,
-        "scores": [round(c.pose.score, 3) for c in pool],
-        "strengths": [round(c.strength, 3) for c in pool],
+        "support_next": max((c.support for c in pool.candidates[1:]), default=0.0),
+        "patches": patches.patches,
+        "scores": [round(c.pose.score, 3) for c in pool.candidates],
+        "strengths": [round(strength, 3) for strength in pool.strengths],
+        "ground_spread_m": [
+            round(c.ground.spread_m, 3) if c.ground is not None and c.ground.known else None
+            for c in pool.candidates
+        ],
+        "mirrored_strengths": None
+        if mirrored is None
+        else [round(c.strength, 3) for c in mirrored.candidates],
+        "null_ratio": null_ratio,
     }
     return Matches(
-        source_px=matches.source_px,
-        target_px=matches.target_px,
-        score=np.clip(matches.score, 0.0, 1.0),
-        hypotheses=tuple(c.pose.hypothesis(pivot) for c in pool),
+        source_px=patches.source_px,
+        target_px=patches.target_px,
+        score=np.clip(patches.score, 0.0, 1.0),
+        hypotheses=tuple(c.pose.hypothesis(pivot) for c in pool.candidates),
         search_radius_m=radius,
-        margin=margin,
+        margin=pool.margin,
         support=best.support,
+        null_ratio=null_ratio,
         report=report,
+    )
+
+
+def mirror(bev: Bev) -> Bev:
+    """Reflect a raster east to west (x to -x): a scene of the same texture that has no right pose."""
+    grid = bev.grid
+    reflected = Grid(-(grid.west + grid.width * grid.cell), grid.north, grid.cell, grid.width, grid.height)
+    return Bev(
+        reflected,
+        np.ascontiguousarray(bev.top[:, ::-1]),
+        np.ascontiguousarray(bev.low[:, ::-1]),
+        np.ascontiguousarray(bev.count[:, ::-1]),
     )
 
 
 class Pyramid:
     """Both rasters' channels at every cell size asked for, made once."""
 
-    def __init__(self, source: Bev, target: Bev) -> None:
-        self._bevs = (source, target)
-        self._layers: dict[int, tuple[Layer, Layer]] = {}
+    def __init__(self, source: Bev, target: Bev, shared: Pyramid | None = None) -> None:
+        self.source, self.target = source, target
+        self._source: dict[int, Layer] = {}
+        # a second source against the same target finds the target's channels made
+        self._target: dict[int, Layer] = {} if shared is None else shared._target
 
     def at(self, factor: int) -> tuple[Layer, Layer]:
         """Return source and target layers at ``factor`` times the finest cell."""
-        if factor not in self._layers:
-            coarse = [coarsen(bev, factor) for bev in self._bevs]
-            source, target = (Layer(bev.grid, channels(bev)) for bev in coarse)
-            self._layers[factor] = (source, target)
-        return self._layers[factor]
+        for bev, layers in ((self.source, self._source), (self.target, self._target)):
+            if factor not in layers:
+                coarse = coarsen(bev, factor)
+                layers[factor] = Layer(coarse.grid, channels(coarse))
+        return self._source[factor], self._target[factor]
 
 
 def search_factors(source: Bev, target: Bev) -> list[int]:
     """Choose the levels of the global search, coarsest first, as multiples of the finest cell.
 
-    The coarsest that still leaves a few dozen cells along the smaller raster, down to the finest that can
-    be searched over all yaws in about two seconds.
+    The coarsest leaves a few dozen cells along the smaller raster, each next one has half its cells, down to
+    the finest that can be searched over all yaws in about two seconds.
     """
     cell = source.grid.cell
-    longest = max(max(bev.grid.shape) for bev in (source, target)) * cell
-    shortest = min(max(bev.grid.shape) for bev in (source, target)) * cell
-    factors = []
-    for wanted in SEARCH_CELLS_M:
-        factor = max(1, round(wanted / cell))
-        size = factor * cell
-        if shortest / size >= 40 and longest / size <= LARGEST_SEARCH and factor not in factors:
+    longest = max(max(bev.grid.shape) for bev in (source, target))
+    shortest = min(max(bev.grid.shape) for bev in (source, target))
+    wanted = max(min(shortest / FEWEST_ACROSS, COARSEST_SEARCH_M / cell), 1.0)
+    affordable = max(1, int(np.ceil(longest / LARGEST_SEARCH)))
+    factors: list[int] = []
+    for _ in range(LEVELS):
+        factor = max(round(wanted), affordable)
+        if factor not in factors:
             factors.append(factor)
-    if not factors:
-        fitting = max(longest / LARGEST_SEARCH, min(shortest / 40, SEARCH_CELLS_M[1]))
-        factors.append(max(1, int(np.ceil(fitting / cell))))
+        wanted = max(wanted / 2.0, 1.0)
     return factors
 
 
-def _margin(pool: Sequence[Candidate]) -> float:
-    return margin_of([candidate.strength for candidate in pool])
+@dataclass(frozen=True)
+class Level:
+    """One level of a search.
+
+    Attributes:
+        factor: its cell as a multiple of the finest.
+        cell_m: its cell, metres.
+        scores: of the hypotheses it proposed.
+
+    """
+
+    factor: int
+    cell_m: float
+    scores: tuple[float, ...]
 
 
-def _search(
-    pyramid: Pyramid,
-    factor: int,
-    settings: CorrelationSettings,
-    advance: Callable[[int], object],
-    prior: Prior | None,
-) -> list[Pose]:
-    source, target = pyramid.at(factor)
-    cell = source.grid.cell
-    smaller = min(float(layer.channels.mask.sum()) for layer in (source, target))
-    fewest = max(settings.min_overlap_m2 / cell**2, settings.min_overlap_share * smaller)
-    steps = round(360.0 / settings.yaw_step_deg)
-    yaws = np.arange(steps) * (2 * np.pi / steps)
-    search = GlobalSearch(source, target, fewest)
-    if prior is not None:
-        known = pose_of(prior.hypothesis, centre_of(source.grid))
-        search.restrict(known.east, known.north, prior.radius_m)
-        yaws = prior.yaws(np.radians(settings.yaw_step_deg))
-    poses = search.run(yaws, PEAKS_A_YAW, 4, advance)
-    apart = distinct(poses, HYPOTHESES, np.radians(2 * settings.yaw_step_deg), 5 * cell)
-    return [pose for i, pose in enumerate(apart) if i < 3 or pose.score >= DROPPED_BELOW * apart[0].score]
+class _Search:
+    """Explores the levels of one source against one target."""
+
+    def __init__(
+        self,
+        source: Bev,
+        target: Bev,
+        scales: Scales,
+        settings: CorrelationSettings,
+        seed: int,
+        advance: Callable[[int], object],
+        shared: Pyramid | None = None,
+    ) -> None:
+        self.pyramid = Pyramid(source, target, shared)
+        self.scales, self.settings, self.seed, self.advance = scales, settings, seed, advance
+        self.terrain_source = Terrain.of(source, scales.terrain_cell_m)
+        self.terrain_target = Terrain.of(target, scales.terrain_cell_m)
+
+    def explore(self, prior: Prior | None, factors: Sequence[int] | None = None) -> tuple[Pool, list[Level]]:
+        """Search level by level until a pose convinces; all of ``factors`` where they are given."""
+        judged: list[Candidate] = []
+        pool, levels = Pool(), []
+        for factor in factors or search_factors(self.pyramid.source, self.pyramid.target):
+            found = self._propose(factor, prior)
+            cell = self.pyramid.source.grid.cell * factor
+            levels.append(Level(factor, cell, tuple(round(pose.score, 3) for pose in found)))
+            if not levels[1:] and prior is None:
+                found = [*found, *self._propose_by_terrain(factor)]
+            judged += self._judge([self._descend(factor, pose) for pose in found])
+            pool = Pool.of(judged, self.scales.same_pose_m)
+            if factors is None and self._convinces(pool):
+                break
+        return pool, levels
+
+    def _convinces(self, pool: Pool) -> bool:
+        return bool(
+            pool.candidates
+            and pool.margin >= self.settings.convincing_margin
+            and pool.candidates[0].neg_log10_p >= self.settings.convincing_neg_log10_p
+        )
+
+    def _yaw_step(self, source: Layer) -> float:
+        """Step over all yaws, radians: about a cell and a half at the smaller raster's rim."""
+        if self.settings.yaw_step_deg is not None:
+            return float(np.radians(self.settings.yaw_step_deg))
+        sides = [max(layer.grid.shape) for layer in (source, self.pyramid.at(1)[1])]
+        rim = min(sides[0], sides[1] * self.pyramid.at(1)[1].grid.cell / source.grid.cell) / 2
+        step = np.degrees(1.5 / max(rim, 1.0))
+        return float(np.radians(np.clip(step, FINEST_YAW_STEP_DEG, COARSEST_YAW_STEP_DEG)))
+
+    def _propose(self, factor: int, prior: Prior | None) -> list[Pose]:
+        source, target = self.pyramid.at(factor)
+        cell = source.grid.cell
+        smaller = min(float(layer.channels.mask.sum()) for layer in (source, target))
+        least = self.settings.min_overlap_m2
+        least = self.scales.least_overlap_m2 if least is None else least
+        fewest = max(least / cell**2, self.settings.min_overlap_share * smaller, FEWEST_OVERLAP_CELLS)
+        step = self._yaw_step(source)
+        count = round(2 * np.pi / step)
+        yaws = np.arange(count) * (2 * np.pi / count)
+        search = GlobalSearch(source, target, fewest)
+        if prior is not None:
+            known = pose_of(prior.hypothesis, centre_of(source.grid))
+            search.restrict(known.east, known.north, prior.radius_m)
+            yaws = prior.yaws(step)
+        poses = search.run(yaws, PEAKS_A_YAW, 4, self.advance)
+        return distinct(poses, HYPOTHESES, 2 * step, 5 * cell)
+
+    def _propose_by_terrain(self, factor: int) -> list[Pose]:
+        """Propose the poses under which the grounds have the same shape, about the centre of a level."""
+        source, target = self.terrain_source, self.terrain_target
+        cell = source.grid.cell
+        least = self.settings.min_overlap_m2
+        least = self.scales.least_overlap_m2 if least is None else least
+        step = COARSEST_YAW_STEP_DEG
+        yaws = np.radians(np.arange(0.0, 360.0, step))
+        if min(source.mask.sum(), target.mask.sum()) < 4 * FEWEST_GROUND_CELLS:
+            return []
+        poses = TerrainSearch(source, target, max(least / cell**2, FEWEST_GROUND_CELLS)).run(yaws)
+        found = distinct(poses, TERRAIN_HYPOTHESES, np.radians(2 * step), 3 * cell)
+        grid = self.pyramid.at(factor)[0].grid
+        return [place_on(pose, source, grid) for pose in found]
+
+    def _descend(self, factor: int, pose: Pose) -> Candidate:
+        """Follow a hypothesis from the level that proposed it to the finest cells."""
+        level, step = factor, 1.0
+        window = 2
+        while True:
+            source, target = self.pyramid.at(level)
+            tries = [
+                score_nearby(
+                    source, target, Pose(pose.yaw + np.radians(k * step), pose.east, pose.north), window
+                )[0]
+                for k in (-2, -1, 0, 1, 2)
+            ]
+            pose = max(tries, key=lambda p: p.score)
+            if level == 1:
+                return Candidate(pose)
+            finer = max(1, level // 2)
+            # the centre of the raster moves a little between levels: same pose, other pivot
+            hypothesis = pose.hypothesis(centre_of(source.grid))
+            pose = pose_of(hypothesis, centre_of(self.pyramid.at(finer)[0].grid))
+            level, step, window = finer, step / 2, 3
+
+    def _judge(self, candidates: Sequence[Candidate]) -> list[Candidate]:
+        """Judge by patches and by the ground all that do not score far below the best of their level."""
+        ranked = sorted(candidates, key=lambda c: -c.pose.score)
+        best = ranked[0].pose.score if ranked else 0.0
+        distinct_ones: list[Candidate] = []
+        for i, candidate in enumerate(ranked):
+            if not np.isfinite(candidate.pose.score):
+                continue
+            if i >= 2 and candidate.pose.score < DROPPED_BELOW * best:
+                break
+            if not any(_same(candidate.pose, c.pose, self.scales.same_pose_m / 4) for c in distinct_ones):
+                distinct_ones.append(candidate)
+        return [self._judge_one(candidate) for candidate in distinct_ones]
+
+    def _judge_one(self, candidate: Candidate) -> Candidate:
+        """Match patches around a hypothesis, let them correct it, and match again from there."""
+        source, target = self.pyramid.at(1)
+        cell = source.grid.cell
+        settings, scales = self.settings, self.scales
+        patch = scales.patch_m if settings.patch_m is None else settings.patch_m
+        wide = scales.search_radius_m if settings.search_radius_m is None else settings.search_radius_m
+        stride = max(4, round(patch / 2 / cell))
+        pose = candidate.pose
+        radius = min(max(RADIUS_CELLS, round(wide / cell)), MAX_RADIUS_CELLS)
+        patches = match_patches(source, target, pose, window=radius, stride=stride)
+        corrected = _corrected(pose, patches, _vote(patches, source, target, self.seed), source, target)
+        rescored = score_nearby(source, target, corrected, 1)[0]
+        # patches that do not agree must not carry a good hypothesis away
+        if rescored.score >= pose.score:
+            pose = rescored
+        patches = match_patches(source, target, pose, window=RADIUS_CELLS, stride=stride)
+        supporting = _vote(patches, source, target, self.seed)
+        ground = compare_ground(
+            self.terrain_source,
+            self.terrain_target,
+            pose.hypothesis(centre_of(source.grid)),
+            plane=not settings.trust_vertical,
+        )
+        return Candidate(pose, patches, supporting, ground)
 
 
-def _descend(pyramid: Pyramid, factor: int, pose: Pose) -> Candidate:
-    """Follow a hypothesis from the level that proposed it to the finest cells."""
-    proposed = pose.score
-    level, step = factor, 1.0
-    window = 2
-    while True:
-        source, target = pyramid.at(level)
-        tries = [
-            score_nearby(
-                source, target, Pose(pose.yaw + np.radians(k * step), pose.east, pose.north), window
-            )[0]
-            for k in (-2, -1, 0, 1, 2)
-        ]
-        pose = max(tries, key=lambda p: p.score)
-        if level == 1:
-            return Candidate(pose, proposed)
-        finer = max(1, level // 2)
-        # the centre of the raster moves a little between levels: same pose, other pivot
-        hypothesis = pose.hypothesis(centre_of(source.grid))
-        pose = pose_of(hypothesis, centre_of(pyramid.at(finer)[0].grid))
-        level, step, window = finer, step / 2, 3
-
-
-def _worth_judging(pool: Sequence[Candidate]) -> list[Candidate]:
-    """Leave out what scores far below the best; the runner-up always stays, for the margin's sake."""
-    best = max((c.pose.score for c in pool), default=0.0)
-    return [c for i, c in enumerate(pool) if i < 2 or c.pose.score >= DROPPED_BELOW * best]
-
-
-def _distinct(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Sort by strength, then score, and join those that came down to the same place."""
-    kept: list[Candidate] = []
-    for candidate in sorted(candidates, key=lambda c: (-c.strength, -c.pose.score)):
-        if np.isfinite(candidate.pose.score) and not any(_same(candidate.pose, k.pose) for k in kept):
-            kept.append(candidate)
-    return kept[:HYPOTHESES]
-
-
-def _same(a: Pose, b: Pose) -> bool:
+def _same(a: Pose, b: Pose, apart_m: float) -> bool:
     apart = float(np.hypot(a.east - b.east, a.north - b.north))
-    return angle_between(a.yaw, b.yaw) < np.radians(5.0) and apart < 12.0
-
-
-def _score_patches(
-    pyramid: Pyramid, candidate: Candidate, settings: CorrelationSettings, seed: int
-) -> Candidate:
-    """Match patches around a hypothesis, let them correct it, and match again from there."""
-    if candidate.patches is not None:
-        return candidate
-    source, target = pyramid.at(1)
-    cell = source.grid.cell
-    stride = max(4, round(settings.patch_m / 2 / cell))
-    pose = candidate.pose
-    radius = max(RADIUS_CELLS, round(settings.search_radius_m / cell))
-    patches = match_patches(source, target, pose, window=radius, stride=stride)
-    corrected = _corrected(pose, patches, _vote(patches, source, target, seed), source, target)
-    rescored = score_nearby(source, target, corrected, 1)[0]
-    # patches that do not agree must not carry a good hypothesis away
-    if rescored.score >= pose.score:
-        pose = rescored
-    patches = match_patches(source, target, pose, window=RADIUS_CELLS, stride=stride)
-    return Candidate(pose, candidate.proposed, patches, _vote(patches, source, target, seed))
+    return angle_between(a.yaw, b.yaw) < np.radians(SAME_YAW_DEG) and apart < apart_m
 
 
 def _vote(patches: PatchMatches, source: Layer, target: Layer, seed: int) -> NDArray[np.bool_]:

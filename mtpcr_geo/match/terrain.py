@@ -1,0 +1,183 @@
+"""The shape of the ground as evidence: where things repeat, the terrain beneath them rarely does.
+
+The band-passed channels of the correlation leave the terrain out, since canopy and roofs hide parts of it and
+two levellings may differ. Here lowest heights in coarse cells are compared after one shift in height, or one
+plane where a vertical is not trusted: as a search of its own that proposes poses, and as a judge of any pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mtpcr_geo.core.arrays import Floats, Image
+from mtpcr_geo.core.grid import Grid
+from mtpcr_geo.core.types import Bev, Hypothesis
+from mtpcr_geo.match.pose import Pose, centre_of, warp_to
+from mtpcr_geo.method.bev import coarsen
+
+NOISE_M = 0.1
+"""Spread of the ground's height differences below which cells, borders and noise leave nothing to compare."""
+FEWEST_CELLS = 8
+KNOWN = 0.99
+"""Weight of filled cells above which an interpolated height is one of the ground alone."""
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Lowest heights in coarse cells.
+
+    Attributes:
+        grid: where they lie, metres.
+        low: (h, w) float32 metres about their median, 0 where empty.
+        mask: (h, w) float32, 1 where filled.
+
+    """
+
+    grid: Grid
+    low: Image
+    mask: Image
+
+    @classmethod
+    def of(cls, bev: Bev, cell_m: float) -> Terrain:
+        """Make it of a height raster, in cells of about ``cell_m`` metres."""
+        coarse = coarsen(bev, max(1, round(cell_m / bev.grid.cell)))
+        filled = coarse.count > 0
+        middle = np.median(coarse.low[filled]) if filled.any() else np.float32(0.0)
+        low = np.where(filled, coarse.low - middle, np.float32(0.0)).astype(np.float32)
+        return cls(coarse.grid, low, filled.astype(np.float32))
+
+
+@dataclass(frozen=True)
+class GroundComparison:
+    """How the shapes of both grounds compare under a pose.
+
+    Attributes:
+        cells: cells compared.
+        spread_m: robust standard deviation of their height differences, after one shift or one plane.
+
+    """
+
+    cells: int
+    spread_m: float
+
+    @property
+    def known(self) -> bool:
+        """Whether there was enough ground to compare."""
+        return self.cells >= FEWEST_CELLS
+
+
+def compare_ground(
+    source: Terrain, target: Terrain, hypothesis: Hypothesis, *, plane: bool = False
+) -> GroundComparison:
+    """Compare the shape of both grounds under a pose.
+
+    Args:
+        source, target: both terrains.
+        hypothesis: the pose.
+        plane: remove the best plane of the differences, for clouds whose vertical is not trusted; else
+            their median alone.
+
+    """
+    row, column = np.nonzero(source.mask)
+    xy = source.grid.to_metres(np.column_stack([column, row]).astype(np.float64))
+    c, s = np.cos(hypothesis.yaw), np.sin(hypothesis.yaw)
+    placed = xy @ np.array([[c, s], [-s, c]]) + hypothesis.shift
+    px = target.grid.to_pixel(placed).astype(np.float32)
+    x, y = px[:, :1], px[:, 1:]
+    weight = cv2.remap(target.mask, x, y, cv2.INTER_LINEAR)[:, 0]
+    known = weight > KNOWN
+    cells = int(known.sum())
+    if cells < FEWEST_CELLS:
+        return GroundComparison(cells, np.inf)
+    height = cv2.remap(target.low, x, y, cv2.INTER_LINEAR)[:, 0]
+    step = (height - source.low[row, column])[known].astype(np.float64)
+    rest = _without_plane(placed[known], step) if plane and cells >= 3 * FEWEST_CELLS else step
+    rest = rest - np.median(rest)
+    return GroundComparison(cells, 1.4826 * float(np.median(np.abs(rest))))
+
+
+def _without_plane(xy: Floats, step: Floats) -> Floats:
+    """Take the best plane from (n,) height differences at (n, 2) places, outliers weighed down."""
+    A = np.column_stack([np.ones(len(xy)), xy - xy.mean(axis=0)])
+    weight = np.ones(len(xy))
+    rest = step
+    for _ in range(4):
+        x = np.linalg.lstsq(A * weight[:, None], step * weight, rcond=None)[0]
+        rest = step - A @ x
+        scale = max(1.4826 * float(np.median(np.abs(rest))), NOISE_M)
+        weight = 1.0 / (1.0 + (rest / (2.0 * scale)) ** 2)
+    return np.asarray(rest)
+
+
+class TerrainSearch:
+    """Finds poses under which both grounds have the same shape, for any yaw and shift.
+
+    The score of a pose is half the logarithm of the likelihood ratio of Gaussian heights: with n cells in
+    common, ``n / 2 * log((var s + var t) / var(t - s))``, each variance about its own mean over those cells.
+
+    Args:
+        source, target: both terrains, of one cell size.
+        min_cells: overlaps of fewer cells are not considered.
+
+    """
+
+    def __init__(self, source: Terrain, target: Terrain, min_cells: float) -> None:
+        self.source, self.target = source, target
+        self.min_cells = max(min_cells, FEWEST_CELLS)
+        self._side = int(np.ceil(np.hypot(*source.grid.shape))) + 2
+        height, width = target.grid.shape
+        self._shape = tuple(cv2.getOptimalDFTSize(n + self._side - 1) for n in (height, width))
+        self._target = [self._spectrum(one) for one in (target.mask, target.low, target.low**2)]
+
+    def _spectrum(self, image: Image) -> Image:
+        padded = np.zeros(self._shape, np.float32)
+        padded[: image.shape[0], : image.shape[1]] = image
+        return cv2.dft(padded, nonzeroRows=image.shape[0])
+
+    def best(self, yaw: float) -> Pose | None:
+        """Return the best shift under one yaw, if any overlap is large enough."""
+        grid = self.target.grid
+        half = self._side * grid.cell / 2
+        square = Grid(-half, half, grid.cell, self._side, self._side)
+        low, mask = warp_to(
+            np.stack([self.source.low, self.source.mask]), self.source.grid, square, Pose(yaw, 0.0, 0.0)
+        )
+        mask = (mask > KNOWN).astype(np.float32)
+        low = low * mask
+        m, a, aa = (self._spectrum(one) for one in (mask, low, low**2))
+        M, A, AA = self._target
+        n, sa, saa, ta, taa, cross = (
+            cv2.idft(cv2.mulSpectrums(t, s, 0, conjB=True), flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)
+            for t, s in ((M, m), (M, a), (M, aa), (A, m), (AA, m), (A, a))
+        )
+        cells = np.maximum(n, 1.0)
+        mean_s, mean_t = sa / cells, ta / cells
+        var_s = np.maximum(saa / cells - mean_s**2, 0.0) + NOISE_M**2
+        var_t = np.maximum(taa / cells - mean_t**2, 0.0) + NOISE_M**2
+        both = cross / cells - mean_s * mean_t
+        rest = np.maximum(var_s + var_t - 2 * both, 2 * NOISE_M**2)
+        score = np.where(n >= self.min_cells, cells / 2 * np.log((var_s + var_t) / rest), -np.inf)
+        row, column = np.unravel_index(int(np.argmax(score)), score.shape)
+        if not np.isfinite(score[row, column]):
+            return None
+        dy = row if row < grid.height else row - self._shape[0]
+        dx = column if column < grid.width else column - self._shape[1]
+        east = grid.west + (dx + self._side / 2) * grid.cell
+        north = grid.north - (dy + self._side / 2) * grid.cell
+        return Pose(yaw, float(east), float(north), float(score[row, column]), round(float(n[row, column])))
+
+    def run(self, yaws: Iterable[float]) -> list[Pose]:
+        """Search all yaws; the best of each, best first."""
+        found = [pose for pose in map(self.best, yaws) if pose is not None]
+        return sorted(found, key=lambda pose: -pose.score)
+
+
+def place_on(pose: Pose, terrain: Terrain, grid: Grid) -> Pose:
+    """Express a pose about the terrain's centre as one about the centre of another raster of the source."""
+    from mtpcr_geo.match.pose import pose_of
+
+    return pose_of(pose.hypothesis(centre_of(terrain.grid)), centre_of(grid))

@@ -1,0 +1,127 @@
+"""Lengths that follow from the data: density, extent and overlap decide, between limits written down here.
+
+No length in metres decides anything by itself: a plot of 20 m and a tile of kilometres go through the same
+rules. The extent that counts is that of the smaller cloud, as the edge of a square of its occupied area.
+
+==================  =======================================  ===============
+length              rule                                     limits
+==================  =======================================  ===============
+cell                so that a cell of the sparser cloud      0.25 to 8 m
+                    holds 1.2 points, but no finer than
+                    1/200 of the extent, up to 1 m
+patch               1/4 of the extent, at least 12 cells     at most 24 m
+search radius       1/4 of a patch, at least 3 cells         at most 6 m
+block               1/5 of the tie points' extent,           at most 40 m
+                    at least a cell
+least overlap       1/5 of the smaller area                  at most 400 m2
+terrain cell        1/8 of the extent, at least 4 cells      1 to 8 m
+same pose           half a patch                             1 to 12 m
+ground cell         twice the raster's cell                  0.5 to 2 m
+==================  =======================================  ===============
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mtpcr_geo.core.types import Bev
+from mtpcr_geo.method.bev import OCCUPANCY_CELL_M, coarsen
+
+POINTS_PER_CELL = 1.2
+"""Mean points per cell at which a raster has few holes and still resolves eaves and crowns."""
+FINEST_CELL_M, COARSEST_CELL_M = 0.25, 8.0
+CELLS_PER_EXTENT = 200.0
+FINEST_BY_EXTENT_M = 1.0
+MAX_PATCH_M, MIN_PATCH_CELLS = 24.0, 12
+MAX_SEARCH_RADIUS_M, MIN_SEARCH_RADIUS_CELLS = 6.0, 3
+MAX_BLOCK_M, BLOCKS_PER_EXTENT = 40.0, 5.0
+MAX_LEAST_OVERLAP_M2, LEAST_OVERLAP_SHARE = 400.0, 0.2
+MIN_TERRAIN_CELL_M, MAX_TERRAIN_CELL_M = 1.0, 8.0
+MIN_SAME_POSE_M, MAX_SAME_POSE_M = 1.0, 12.0
+MIN_GROUND_CELL_M, MAX_GROUND_CELL_M = 0.5, 2.0
+
+
+def cell_for(densities: tuple[float, ...], extent_m: float, finest_m: float = FINEST_CELL_M) -> float:
+    """Choose one cell for rasters, in steps of a quarter (below 1 m) or half a metre.
+
+    Args:
+        densities: points per occupied square metre of each cloud.
+        extent_m: of the smaller cloud, metres.
+        finest_m: no finer than this, metres.
+
+    """
+    by_density = float(np.sqrt(POINTS_PER_CELL / min(densities)))
+    by_extent = min(extent_m / CELLS_PER_EXTENT, FINEST_BY_EXTENT_M)
+    wanted = max(by_density, by_extent)
+    step = 0.25 if wanted < 0.875 else 0.5
+    return float(np.clip(np.round(wanted / step) * step, max(finest_m, FINEST_CELL_M), COARSEST_CELL_M))
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Lengths of the search and of the judgement, from two rasters.
+
+    Attributes:
+        cell_m: cell of the rasters, metres.
+        extent_m: edge of a square of the smaller cloud's occupied area, metres.
+        patch_m: edge of the patches of local matches, metres.
+        search_radius_m: how far a patch may lie from where a hypothesis puts it, metres.
+        least_overlap_m2: smallest overlap considered, square metres.
+        terrain_cell_m: cell in which the shape of the ground is compared, metres.
+        same_pose_m: poses closer than this are one, metres.
+
+    """
+
+    cell_m: float
+    extent_m: float
+    patch_m: float
+    search_radius_m: float
+    least_overlap_m2: float
+    terrain_cell_m: float
+    same_pose_m: float
+
+
+def occupied_area(bev: Bev) -> float:
+    """Return the area of the cells of about 2 m that hold points, square metres: gaps between rings count."""
+    coarse = coarsen(bev, max(1, round(OCCUPANCY_CELL_M / bev.grid.cell)))
+    return float((coarse.count > 0).sum()) * coarse.grid.cell**2
+
+
+def scales_of(source: Bev, target: Bev) -> Scales:
+    """Derive the lengths of search and judgement from two rasters; see the table above."""
+    cell = max(source.grid.cell, target.grid.cell)
+    areas = [occupied_area(bev) for bev in (source, target)]
+    extent = float(np.sqrt(max(min(areas), cell**2)))
+    patch = max(min(extent / 4.0, MAX_PATCH_M), MIN_PATCH_CELLS * cell)
+    return Scales(
+        cell_m=cell,
+        extent_m=extent,
+        patch_m=patch,
+        search_radius_m=max(min(patch / 4.0, MAX_SEARCH_RADIUS_M), MIN_SEARCH_RADIUS_CELLS * cell),
+        least_overlap_m2=min(LEAST_OVERLAP_SHARE * min(areas), MAX_LEAST_OVERLAP_M2),
+        terrain_cell_m=float(
+            np.clip(max(extent / 8.0, 4.0 * cell), MIN_TERRAIN_CELL_M, max(MAX_TERRAIN_CELL_M, 4.0 * cell))
+        ),
+        same_pose_m=float(np.clip(patch / 2.0, MIN_SAME_POSE_M, MAX_SAME_POSE_M)),
+    )
+
+
+def block_for(xy: np.ndarray, cell: float) -> float:
+    """Choose the edge of the blocks in which tie points are held out, metres.
+
+    Args:
+        xy: (n, 2) tie points, metres.
+        cell: of the rasters, metres.
+
+    """
+    if len(xy) < 2:
+        return MAX_BLOCK_M
+    spans = np.percentile(xy, 95, axis=0) - np.percentile(xy, 5, axis=0)
+    return float(np.clip(np.sqrt(max(np.prod(spans), 0.0)) / BLOCKS_PER_EXTENT, cell, MAX_BLOCK_M))
+
+
+def ground_cell_for(cell: float) -> float:
+    """Choose the cell in which both clouds' ground is compared, metres, from the rasters' cell."""
+    return float(np.clip(2.0 * cell, MIN_GROUND_CELL_M, MAX_GROUND_CELL_M))
