@@ -21,6 +21,7 @@ code  meaning
 
 EXIT_DOUBTFUL = 3
 EXIT_REFUSED = 4
+EXIT_INTERRUPTED = 130
 
 
 class MtpcrError(Exception):
