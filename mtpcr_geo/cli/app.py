@@ -62,7 +62,7 @@ VERBS = {
     ),
     "demo": Verb(
         "mtpcr_geo.cli.demo_verb:command",
-        "Register a simulated town's clouds, from a street and from the air, and compare with the truth.",
+        "Register a simulated town, scanned from a street and from the air, and compare with the truth.",
     ),
     "benchmark": Verb(
         "mtpcr_geo.benchmark.command:benchmark",

@@ -10,7 +10,7 @@ from mtpcr_geo.cli.shared import end_with, progress_bars
 
 
 def run(options: DemoVerb) -> None:
-    """Register a simulated town's clouds, from a street and from the air, and compare with the truth.
+    """Register a simulated town, scanned from a street and from the air, and compare with the truth.
 
     Examples:
         mtpcr-geo demo
@@ -21,7 +21,7 @@ def run(options: DemoVerb) -> None:
     from mtpcr_geo.cli.summary import print_registration
 
     with progress_bars(options.quiet) as progress:
-        result = run_demo(options.out, seed=options.seed, overwrite=options.overwrite, progress=progress)
+        result = run_demo(options.out, overwrite=options.overwrite, progress=progress)
     if not options.quiet:
         # the summary names the files
         print_registration(result.registration, files=False)

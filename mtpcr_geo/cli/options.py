@@ -161,6 +161,5 @@ class DemoVerb(VerbOptions):
     out: Annotated[
         Path, Field(description="folder for the demonstration's files"), Shown(OUTPUT, ("--out", "-o"))
     ] = Path("mtpcr-demo")
-    seed: Annotated[int, Field(ge=0, description="seed of the simulated town"), Shown(RUN)] = 0
     overwrite: Overwrite = False
     quiet: QuietVerdict = False

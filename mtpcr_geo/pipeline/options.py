@@ -75,7 +75,7 @@ Vertical = Annotated[
 OutCrs = Annotated[
     str | None, Field(description="CRS of the result, where it shall not be the target's"), Shown(INPUTS)
 ]
-Level = Annotated[
+LevelMethod = Annotated[
     Literal["auto", "ransac", "none"],
     Field(
         description="how to make the clouds upright: auto trusts the vertical of a georeferenced cloud and "
@@ -164,7 +164,7 @@ class MethodOptions(BaseModel):
     source_crs: SourceCrs = None
     target_crs: TargetCrs = None
     local: Local = False
-    level: Level = "auto"
+    level: LevelMethod = "auto"
     cell: Cell = None
     vertical: Vertical = "refuse"
     out_crs: OutCrs = None
