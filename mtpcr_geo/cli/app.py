@@ -17,7 +17,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 import mtpcr_geo
-from mtpcr_geo.core.errors import EXIT_INTERRUPTED, MtpcrError, OptionError
+from mtpcr_geo.core.errors import EXIT_INTERRUPTED, MtpcrError, OptionError, one_line
 from mtpcr_geo.core.suggestions import meant
 
 NAME = "mtpcr-geo"
@@ -169,7 +169,7 @@ def _errors_in_one_line() -> Iterator[None]:
     try:
         yield
     except MtpcrError as error:
-        typer.echo(f"{NAME}: error: {_printable(str(error))}", err=True)
+        typer.echo(f"{NAME}: error: {one_line(str(error))}", err=True)
         raise typer.Exit(error.exit_code) from None
     except KeyboardInterrupt:
         typer.echo(f"{NAME}: interrupted; no half-written file is left", err=True)
@@ -185,12 +185,6 @@ def _option_error(error: Any, what: str, valid: list[str]) -> OptionError:
         )
     message = error.format_message().rstrip(".")
     return OptionError(f"{message[:1].lower()}{message[1:]}; see {what} --help")
-
-
-def _printable(text: str) -> str:
-    """Return a text in one line, without control characters."""
-    line = " ".join(text.split())
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in line)
 
 
 app = typer.Typer(

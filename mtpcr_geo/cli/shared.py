@@ -12,7 +12,7 @@ import typer
 
 from mtpcr_geo.cli import options
 from mtpcr_geo.cli.parameters import switch
-from mtpcr_geo.core.errors import EXIT_DOUBTFUL, EXIT_REFUSED
+from mtpcr_geo.core.errors import EXIT_DOUBTFUL, EXIT_REFUSED, one_line
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.types import Verdict
@@ -44,7 +44,7 @@ def end_with(verdict: Verdict | None, *, quiet: bool) -> typer.Exit:
         return typer.Exit(0)
     if quiet and verdict.name != "accepted":
         reason = f": {verdict.reasons[0]}" if verdict.reasons else ""
-        typer.echo(f"mtpcr-geo: {verdict.name}{reason}", err=True)
+        typer.echo(one_line(f"mtpcr-geo: {verdict.name}{reason}"), err=True)
     return typer.Exit(EXIT_BY_VERDICT[verdict.name])
 
 
