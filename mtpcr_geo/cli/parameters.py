@@ -119,7 +119,6 @@ def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
     else:
         declaration["metavar"] = name.upper() if shown.argument else _metavar(field.annotation)
         kind = Path if Path in (field.annotation, *get_args(field.annotation)) else str
-        kind = kind if required else kind | None
     info: Any
     if shown.argument:
         info = typer.Argument(default, **declaration)

@@ -59,15 +59,15 @@ def run_pipeline(options: PipelineVerb, progress: Progress) -> RunResult | None:
         MtpcrError: for whatever a user can cause.
 
     """
+    # an unknown option may stand where the file is expected
+    file, overrides = split_arguments([*([str(options.file)] if options.file else []), *options.more])
+    if file is None:
+        raise OptionError("name a pipeline file, or - for standard input")
     from mtpcr_geo.io.outputs import OutputSet
     from mtpcr_geo.pipeline import grammar
     from mtpcr_geo.pipeline.api import metadata_of, read_text
     from mtpcr_geo.pipeline.runner import Settings, execute, validate
 
-    # an unknown option may stand where the file is expected
-    file, overrides = split_arguments([*([str(options.file)] if options.file else []), *options.more])
-    if file is None:
-        raise OptionError("name a pipeline file, or - for standard input")
     elements = grammar.parse(read_text(file), "standard input" if file == "-" else file)
     grammar.override(elements, overrides)
     specs = grammar.link(elements)
