@@ -279,7 +279,7 @@ class _Check:
         sides = [(looked, looked.measured) for looked in self.looked.values() if looked.measured is not None]
         if self.refusals or not sides:
             return
-        cell = choose_cell(*(measured.per_m2 for _, measured in sides))
+        cell = choose_cell([measured.per_m2 for _, measured in sides], finest=1.0)
         for looked, measured in sides:
             with self.stopping("raster-size", looked.role):
                 grid_around(measured.low, measured.high, cell)

@@ -95,6 +95,7 @@ class Levelling(ComparesArrays):
         method: "none", "plane" (the paper) or "verticals".
         tilt_deg: angle between the cloud's z axis and the vertical found, degrees.
         why: why it was kept as it is, where it was.
+        trusted: whether the vertical is known: by the CRS, or since the user says so.
         plane_tilt_deg, plane_inlier_share: tilt of the ground plane, degrees, and share of points on it.
         verticals: points on walls, poles and trunks that agree on the vertical.
         verticals_spread_deg: their robust spread about it, degrees.
@@ -106,6 +107,7 @@ class Levelling(ComparesArrays):
     method: LevellingMethod = "none"
     tilt_deg: float = 0.0
     why: str | None = None
+    trusted: bool = False
     plane_tilt_deg: float | None = None
     plane_inlier_share: float | None = None
     verticals: int | None = None

@@ -45,10 +45,10 @@ HYPOTHESES = 12
 TERRAIN_HYPOTHESES = 6
 DROPPED_BELOW = 0.4
 """Share of the best score at fine cells below which a hypothesis is not judged by patches."""
-RADIUS_CELLS = 4
-"""How far the final patch matches may lie from where the pose puts them, cells."""
-AGREE_CELLS = 1.5
-MAX_RADIUS_CELLS = 8
+RADIUS_TOLERANCES = 4.0
+"""How far the final patch matches may lie from where the pose puts them, tolerances."""
+AGREE_TOLERANCES = 1.5
+MAX_RADIUS_CELLS = 10
 SAME_YAW_DEG = 5.0
 GROUND_SCALE_M = 0.1
 """Spread of the ground's height differences, beyond the least of all hypotheses, that halves a strength."""
@@ -137,7 +137,8 @@ class Candidate:
         if self.patches is None or self.supporting is None:
             return 0.0
         agreeing = max(int(self.supporting.sum()) - 2, 0)
-        return neg_log10_p(agreeing, len(self.patches), chance_within(AGREE_CELLS, RADIUS_CELLS - 0.5))
+        chance = chance_within(AGREE_TOLERANCES, RADIUS_TOLERANCES - 0.5)
+        return neg_log10_p(agreeing, len(self.patches), chance)
 
     @property
     def strength(self) -> float:
@@ -227,7 +228,7 @@ def match(
     patches = best.patches
     assert patches is not None  # hypotheses in a pool are judged by patches
     pivot = centre_of(source.grid)
-    radius = (RADIUS_CELLS - 0.5) * source.grid.cell
+    radius = _radius_cells(scales) * source.grid.cell - source.grid.cell / 2
     null_ratio = None
     if mirrored is not None:
         strongest = max((c.strength for c in mirrored.candidates), default=0.0)
@@ -460,15 +461,19 @@ class _Search:
         wide = scales.search_radius_m if settings.search_radius_m is None else settings.search_radius_m
         stride = max(4, round(patch / 2 / cell))
         pose = candidate.pose
-        radius = min(max(RADIUS_CELLS, round(wide / cell)), MAX_RADIUS_CELLS)
+        narrow = _radius_cells(scales)
+        agree = AGREE_TOLERANCES * scales.tolerance_m
+        radius = min(max(narrow, round(wide / cell)), MAX_RADIUS_CELLS)
         patches = match_patches(source, target, pose, window=radius, stride=stride)
-        corrected = _corrected(pose, patches, _vote(patches, source, target, self.seed), source, target)
+        corrected = _corrected(
+            pose, patches, _vote(patches, source, target, agree, self.seed), source, target, agree
+        )
         rescored = score_nearby(source, target, corrected, 1)[0]
         # patches that do not agree must not carry a good hypothesis away
         if rescored.score >= pose.score:
             pose = rescored
-        patches = match_patches(source, target, pose, window=RADIUS_CELLS, stride=stride)
-        supporting = _vote(patches, source, target, self.seed)
+        patches = match_patches(source, target, pose, window=narrow, stride=stride)
+        supporting = _vote(patches, source, target, agree, self.seed)
         ground = compare_ground(
             self.terrain_source,
             self.terrain_target,
@@ -483,14 +488,19 @@ def _same(a: Pose, b: Pose, apart_m: float) -> bool:
     return angle_between(a.yaw, b.yaw) < np.radians(SAME_YAW_DEG) and apart < apart_m
 
 
-def _vote(patches: PatchMatches, source: Layer, target: Layer, seed: int) -> NDArray[np.bool_]:
-    """Mark the patches that agree on one yaw and shift."""
+def _radius_cells(scales: Scales) -> int:
+    """Return how far the final patch matches may lie from where the pose puts them, cells."""
+    return max(1, round(RADIUS_TOLERANCES * scales.tolerance_m / scales.cell_m))
+
+
+def _vote(patches: PatchMatches, source: Layer, target: Layer, agree_m: float, seed: int) -> Mask:
+    """Mark the patches that agree on one yaw and shift within ``agree_m`` metres."""
     s, t = source.grid.to_metres(patches.source_px), target.grid.to_metres(patches.target_px)
-    return ransac_upright(s, t, AGREE_CELLS * source.grid.cell, seed, 500)[1]
+    return ransac_upright(s, t, agree_m, seed, 500)[1]
 
 
 def _corrected(
-    pose: Pose, patches: PatchMatches, supporting: NDArray[np.bool_], source: Layer, target: Layer
+    pose: Pose, patches: PatchMatches, supporting: Mask, source: Layer, target: Layer, agree_m: float
 ) -> Pose:
     """Fit yaw and shift to the patches, starting from those that agree."""
     if supporting.sum() < 4:
@@ -501,7 +511,7 @@ def _corrected(
         np.hstack([target.grid.to_metres(patches.target_px), flat]),
         start=supporting,
         weight=patches.score**2,
-        floor=AGREE_CELLS * source.grid.cell,
+        floor=agree_m,
         upright=True,
     )
     east, north = transforms.apply(solution.T, np.array([[*centre_of(source.grid), 0.0]]))[0, :2]

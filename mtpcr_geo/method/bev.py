@@ -30,7 +30,9 @@ MAX_CELLS = 64_000_000
 """Cells beyond which a raster is refused: 0.8 GiB for the three bands."""
 
 OCCUPANCY_CELL_M = 2.0
-FINEST_AUTO_CELL_M = 1.0
+FINEST_AUTO_CELL_M = 0.25
+CELLS_PER_EXTENT = 200.0
+FINEST_BY_EXTENT_M = 1.0
 COARSEST_AUTO_CELL_M = 8.0
 POINTS_PER_CELL = 1.2
 """Mean points per cell at which a raster has few holes and still resolves eaves and crowns."""
@@ -234,7 +236,7 @@ def choose_cells(
     coverages: Sequence[Coverage],
     *,
     cell: float | None = None,
-    finest: float = FINEST_AUTO_CELL_M,
+    finest: float | None = None,
     resolution: Resolution = "common",
     gamma: float | None = None,
 ) -> Cells:
@@ -243,7 +245,8 @@ def choose_cells(
     Args:
         coverages: of the clouds.
         cell: the cell that is wanted, metres; chosen from the densities if None.
-        finest: no finer cell is chosen than this, metres.
+        finest: no finer cell is chosen than this, metres, and the extent of the clouds plays no part; if
+            None, it does.
         resolution: "common" for one cell; "eq1" and "eq1_occupied" for a cell of each cloud's own, from
             points per area of the bounding box, as printed, or of the occupied ground.
         gamma: the gamma of Eq. 1, metres; see `usual_gamma` if None.
@@ -252,27 +255,37 @@ def choose_cells(
         RegistrationError: if Eq. 1 gives a cell of no use.
 
     """
-    usual = cell or choose_cell(*(one.per_m2 for one in coverages), finest=finest)
+    densities = [one.per_m2 for one in coverages]
+    extent = float(np.sqrt(min(one.occupied_m2 for one in coverages)))
+    by_size = {"extent_m": extent} if finest is None else {"extent_m": 0.0, "finest": finest}
+    usual = cell or choose_cell(densities, **by_size)
     if resolution == "common":
         return Cells((usual,) * len(coverages))
     areas = [one.box_m2 if resolution == "eq1" else one.occupied_m2 for one in coverages]
-    densities = tuple(one.points / area for one, area in zip(coverages, areas, strict=True))
-    gamma = gamma or usual_gamma(densities, usual)
+    per_area = tuple(one.points / area for one, area in zip(coverages, areas, strict=True))
+    gamma = gamma or usual_gamma(per_area, usual)
     res = [resolution_of(one.points, area, gamma) for one, area in zip(coverages, areas, strict=True)]
     return Cells(tuple(cell_of(one) for one in res), gamma)
 
 
-def choose_cell(*densities: float, finest: float = FINEST_AUTO_CELL_M) -> float:
-    """Choose one cell size for both rasters, metres: set by the sparser cloud, in steps of half a metre.
+def choose_cell(
+    densities: Sequence[float], extent_m: float = np.inf, finest: float = FINEST_AUTO_CELL_M
+) -> float:
+    """Choose one cell size for both rasters, metres, in steps of a quarter (below 1 m) or half a metre.
+
+    A cell of the sparser cloud holds 1.2 points; but small sites are cut into some 200 cells across at most,
+    and sites of 200 m and more into cells of 1 m at the finest.
 
     Args:
         densities: points per occupied square metre of each cloud.
+        extent_m: edge of a square of the smaller cloud's occupied area, metres.
         finest: no finer than this, metres.
 
     """
-    sparsest = min(densities)
-    wanted = np.sqrt(POINTS_PER_CELL / sparsest)
-    return float(np.clip(np.round(wanted * 2) / 2, finest, COARSEST_AUTO_CELL_M))
+    by_density = float(np.sqrt(POINTS_PER_CELL / min(densities)))
+    wanted = max(by_density, min(extent_m / CELLS_PER_EXTENT, FINEST_BY_EXTENT_M))
+    step = 0.25 if wanted < 0.875 else 0.5
+    return float(np.clip(np.round(wanted / step) * step, finest, COARSEST_AUTO_CELL_M))
 
 
 def resolution_of(count: int, area_m2: float, gamma: float) -> float:

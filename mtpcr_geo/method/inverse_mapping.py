@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.types import Bev, Matches, TiePoints
 from mtpcr_geo.method.images import height_span
+from mtpcr_geo.method.scales import block_for
 
 Surface = Literal["ground", "top", "grey"]
 Pixel = Literal["centre", "ceil", "printed"]
@@ -61,7 +62,7 @@ def tie_points_of(
     surface: Surface = "ground",
     pixel: Pixel = "centre",
     folds: int = 4,
-    block_m: float = 40.0,
+    block_m: float | None = None,
     seed: int = 0,
 ) -> TiePoints:
     """Map matches back to 3D (Eq. 5), and set some aside to judge the result by.
@@ -75,7 +76,7 @@ def tie_points_of(
         target: raster of the cloud that stays.
         surface, pixel: see `inverse_mapping`.
         folds: parts into which the blocks are dealt; the first is held out from the solve.
-        block_m: edge of a block, metres.
+        block_m: edge of a block, metres; from the tie points' extent if None.
         seed: chooses the blocks.
 
     """
@@ -83,7 +84,8 @@ def tie_points_of(
     t = inverse_mapping(matches.target_px, target, surface=surface, pixel=pixel)
     known = np.isfinite(s[:, 2]) & np.isfinite(t[:, 2])
     s, t, score = s[known], t[known], matches.score[known]
-    fold = folds_of(t[:, :2], folds, block_m, seed)
+    block = block_for(t[:, :2], target.grid.cell) if block_m is None else block_m
+    fold = folds_of(t[:, :2], folds, block, seed)
     return TiePoints(s, t, score, fold, fold == 0, np.ones(len(s), bool))
 
 

@@ -47,7 +47,8 @@ def level(xyz: Floats, mode: Mode, georeferenced: bool, seed: int = 0) -> Levell
 
     """
     if mode == "none" or (mode == "auto" and georeferenced):
-        return Levelling(why="kept as it is" if mode == "none" else "the CRS defines the vertical")
+        why = "kept as it is" if mode == "none" else "the CRS defines the vertical"
+        return Levelling(why=why, trusted=True)
     rng = np.random.default_rng(seed)
     centre = xyz.mean(axis=0)
     up, share = ground_plane(one_per_voxel(xyz - centre, 1.0, rng, 30_000), rng)

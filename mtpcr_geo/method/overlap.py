@@ -15,11 +15,16 @@ from mtpcr_geo.core.types import Bev
 from mtpcr_geo.method.bev import grid_around, rasterise
 
 OVERLAP_CELL_M = 2.0
+LOW_RADIUS_M = 6.0
+LOW_ABOVE_M = 0.7
+SLOPE_RADIUS_M = 8.0
+STEEPEST = 1.0
+"""Slope, rise over run, beyond which steps count as walls and not as ground."""
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """Both clouds on one grid of 2 m cells.
+    """Both clouds on one grid.
 
     Attributes:
         grid: the common grid.
@@ -62,27 +67,65 @@ class Overlap:
 
         """
         both = (self.source.count > 0) & (self.target.count > 0)
-        both &= _lies_low(self.source.low) & _lies_low(self.target.low)
+        both &= _lies_low(self.source.low, self.grid.cell) & _lies_low(self.target.low, self.grid.cell)
         row, column = np.nonzero(both)
         xy = self.grid.to_metres(np.column_stack([column, row]).astype(np.float64))
         step = (self.target.low - self.source.low)[both].astype(np.float64)
         return xy, step
 
 
-def overlap_of(source: Floats, target: Floats, cell: float = OVERLAP_CELL_M, reach: int = 1) -> Overlap:
-    """Lay both clouds, (n, 3) and (m, 3) metres in one frame, on one grid over the part they may share."""
+def overlap_of(
+    source: Floats, target: Floats, cell: float = OVERLAP_CELL_M, margin_cells: int = 1
+) -> Overlap:
+    """Lay both clouds on one grid over the part they may share.
+
+    Args:
+        source, target: (n, 3) and (m, 3) metres in one frame.
+        cell: edge of a cell, metres.
+        margin_cells: cells by which a filled cell counts around itself.
+
+    """
     (low_s, high_s), (low_t, high_t) = transforms.bounds(source), transforms.bounds(target)
     low, high = np.maximum(low_s, low_t) - 2 * cell, np.minimum(high_s, high_t) + 2 * cell
     grid = grid_around(low, np.maximum(high, low + cell), cell)
     s, t = rasterise([source], grid), rasterise([target], grid)
-    window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    window = np.ones((2 * margin_cells + 1, 2 * margin_cells + 1), np.uint8)
     near = [cv2.dilate((bev.count > 0).astype(np.uint8), window) > 0 for bev in (s, t)]
     return Overlap(grid, s, t, near[0] & near[1])
 
 
-def _lies_low(low: NDArray[np.float32], above: float = 0.7) -> Mask:
-    """Cells whose lowest point is little above the lowest within 3 cells."""
-    filled = np.where(np.isnan(low), np.float32(np.inf), low)
-    lowest = cv2.erode(filled, np.ones((7, 7), np.uint8), borderType=cv2.BORDER_REPLICATE)
+def _lies_low(low: NDArray[np.float32], cell: float, above: float = LOW_ABOVE_M) -> Mask:
+    """Mark cells whose lowest point is little above the lowest near by, as far as the ground's slope goes.
+
+    Args:
+        low: (h, w) lowest heights, metres, NaN where empty.
+        cell: edge of a cell, metres.
+        above: metres above the lowest around that still count as ground on the level.
+
+    """
+    filled = np.isfinite(low)
+    if not filled.any():
+        return filled
+    radius = max(1, round(LOW_RADIUS_M / cell))
+    window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    height = np.where(filled, low, np.float32(np.inf))
+    lowest = cv2.erode(height, window, borderType=cv2.BORDER_REPLICATE)
+    lowest = np.where(np.isfinite(lowest), lowest, np.float32(np.nan))
+    # the slope of the ground over some cells; where it is not known, none
+    known = np.isfinite(lowest).astype(np.float32)
+    middle = np.float32(np.nanmedian(lowest))
+    base = np.where(known > 0, lowest - middle, np.float32(0))
+    sigma = max(SLOPE_RADIUS_M / cell, 1.0)
+    weight = cv2.GaussianBlur(known, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    smooth = cv2.GaussianBlur(base, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    smooth = smooth / np.maximum(weight, np.float32(1e-3))
+    east = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, borderType=cv2.BORDER_REPLICATE) / np.float32(
+        8 * cell
+    )
+    north = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, borderType=cv2.BORDER_REPLICATE) / np.float32(
+        8 * cell
+    )
+    slope = np.minimum(np.hypot(east, north), np.float32(STEEPEST))
+    allowed = np.float32(above) + slope * np.float32(radius * cell)
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.isfinite(filled) & (filled - lowest < above))
+        return np.asarray(filled & (low - lowest < allowed))

@@ -1,7 +1,7 @@
 """Lengths that follow from the data: density, extent and overlap decide, between limits written down here.
 
 No length in metres decides anything by itself: a plot of 20 m and a tile of kilometres go through the same
-rules. The extent that counts is that of the smaller cloud, as the edge of a square of its occupied area.
+rules. Cells are chosen by `mtpcr_geo.method.bev.choose_cell`, the rest here. The extent that counts is that of the smaller cloud, as the edge of a square of its occupied area.
 
 ==================  =======================================  ===============
 length              rule                                     limits
@@ -17,6 +17,7 @@ least overlap       1/5 of the smaller area                  at most 400 m2
 terrain cell        1/8 of the extent, at least 4 cells      1 to 8 m
 same pose           half a patch                             1 to 12 m
 ground cell         twice the raster's cell                  0.5 to 2 m
+tolerance           a cell                                   at least 0.5 m
 ==================  =======================================  ===============
 """
 
@@ -29,11 +30,6 @@ import numpy as np
 from mtpcr_geo.core.types import Bev
 from mtpcr_geo.method.bev import OCCUPANCY_CELL_M, coarsen
 
-POINTS_PER_CELL = 1.2
-"""Mean points per cell at which a raster has few holes and still resolves eaves and crowns."""
-FINEST_CELL_M, COARSEST_CELL_M = 0.25, 8.0
-CELLS_PER_EXTENT = 200.0
-FINEST_BY_EXTENT_M = 1.0
 MAX_PATCH_M, MIN_PATCH_CELLS = 24.0, 12
 MAX_SEARCH_RADIUS_M, MIN_SEARCH_RADIUS_CELLS = 6.0, 3
 MAX_BLOCK_M, BLOCKS_PER_EXTENT = 40.0, 5.0
@@ -41,22 +37,7 @@ MAX_LEAST_OVERLAP_M2, LEAST_OVERLAP_SHARE = 400.0, 0.2
 MIN_TERRAIN_CELL_M, MAX_TERRAIN_CELL_M = 1.0, 8.0
 MIN_SAME_POSE_M, MAX_SAME_POSE_M = 1.0, 12.0
 MIN_GROUND_CELL_M, MAX_GROUND_CELL_M = 0.5, 2.0
-
-
-def cell_for(densities: tuple[float, ...], extent_m: float, finest_m: float = FINEST_CELL_M) -> float:
-    """Choose one cell for rasters, in steps of a quarter (below 1 m) or half a metre.
-
-    Args:
-        densities: points per occupied square metre of each cloud.
-        extent_m: of the smaller cloud, metres.
-        finest_m: no finer than this, metres.
-
-    """
-    by_density = float(np.sqrt(POINTS_PER_CELL / min(densities)))
-    by_extent = min(extent_m / CELLS_PER_EXTENT, FINEST_BY_EXTENT_M)
-    wanted = max(by_density, by_extent)
-    step = 0.25 if wanted < 0.875 else 0.5
-    return float(np.clip(np.round(wanted / step) * step, max(finest_m, FINEST_CELL_M), COARSEST_CELL_M))
+MIN_TOLERANCE_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -81,6 +62,11 @@ class Scales:
     least_overlap_m2: float
     terrain_cell_m: float
     same_pose_m: float
+
+    @property
+    def tolerance_m(self) -> float:
+        """Plan distance within which a match agrees with a pose, metres: the rasters resolve no better."""
+        return max(self.cell_m, MIN_TOLERANCE_M)
 
 
 def occupied_area(bev: Bev) -> float:

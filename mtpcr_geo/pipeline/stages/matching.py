@@ -72,10 +72,27 @@ class MatchOptions(StageOptions):
     """Options of mtpcr.match."""
 
     method: MatcherName = "correlation"
-    yaw_step: float = Field(4.0, gt=0, le=30, description="step of the search over all yaws, degrees")
-    patch: float = Field(24.0, gt=0, description="edge of a patch of the local matches, metres")
-    search_radius: float = Field(6.0, gt=0, description="how far a patch may lie from the hypothesis, metres")
-    min_overlap: float = Field(400.0, ge=0, description="smallest overlap considered, square metres")
+    yaw_step: float | None = Field(
+        None,
+        gt=0,
+        le=30,
+        description="step of the search over all yaws, degrees; follows from the clouds' extent if not given",
+    )
+    patch: float | None = Field(
+        None,
+        gt=0,
+        description="edge of a patch of the local matches, metres; from the clouds' extent if not given",
+    )
+    search_radius: float | None = Field(
+        None,
+        gt=0,
+        description="how far a patch may lie from the hypothesis, metres; from the patch if not given",
+    )
+    min_overlap: float | None = Field(
+        None,
+        ge=0,
+        description="smallest overlap considered, square metres; from the clouds' area if not given",
+    )
     prior: PriorKind = "none"
     prior_sigma: PriorSigma = 5.0
     prior_yaw: PriorYaw = 5.0
@@ -146,7 +163,8 @@ class Match(Stage):
         pair = self.one_pair(inputs)
         source, target = bevs_of(self, pair)
         prior = self._prior(pair)
-        matcher = self._matcher or self._make(prior)
+        trusted = pair.source.levelling.trusted and pair.target.levelling.trusted
+        matcher = self._matcher or self._make(prior, trusted)
         if matcher.needs_one_cell and source.grid.cell != target.grid.cell:
             raise OptionError(
                 f"{self.label}: {self.options.method} needs one cell size, and the rasters have "
@@ -169,7 +187,7 @@ class Match(Stage):
         known = None if prior is None else georeference(pair, self.label)
         return pair.with_(matches=replace(matches, matcher=matcher), T_prior=known)
 
-    def _make(self, prior: Prior | None) -> Matcher:
+    def _make(self, prior: Prior | None, trust_vertical: bool = True) -> Matcher:
         from mtpcr_geo.match.correlation import CorrelationSettings
         from mtpcr_geo.match.registry import CorrelationMatcher, KeypointSettings, make_matcher
 
@@ -179,6 +197,7 @@ class Match(Stage):
             patch_m=o.patch,
             search_radius_m=o.search_radius,
             min_overlap_m2=o.min_overlap,
+            trust_vertical=trust_vertical,
         )
         if o.method == "correlation":
             return CorrelationMatcher(correlation, prior)

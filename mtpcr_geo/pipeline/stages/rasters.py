@@ -125,8 +125,12 @@ class BevOptions(StageOptions):
     """Options of mtpcr.bev."""
 
     cell: Cell = None
-    finest: float = Field(
-        1.0, ge=0.25, le=8, allow_inf_nan=False, description="no finer cell is chosen than this, metres"
+    finest: float | None = Field(
+        None,
+        ge=0.25,
+        le=8,
+        allow_inf_nan=False,
+        description="no finer cell is chosen than this, metres; chosen from the clouds' extent if not given",
     )
     resolution: Literal["common", "eq1", "eq1_occupied"] = Field(
         "common",

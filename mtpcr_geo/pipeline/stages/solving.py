@@ -65,8 +65,11 @@ class InverseMappingOptions(StageOptions):
         le=20,
         description="parts of the tie points' ground; the first is held out from the solve to judge it by",
     )
-    block: float = Field(
-        40.0, gt=0, description="edge of the blocks in which tie points are held out, metres"
+    block: float | None = Field(
+        None,
+        gt=0,
+        description="edge of the blocks in which tie points are held out, metres; from their extent if not "
+        "given",
     )
     seed: Seed = 0
 
