@@ -136,7 +136,7 @@ class TerrainSearch:
     def _spectrum(self, image: Image) -> Image:
         padded = np.zeros(self._shape, np.float32)
         padded[: image.shape[0], : image.shape[1]] = image
-        return cv2.dft(padded, nonzeroRows=image.shape[0])
+        return np.asarray(cv2.dft(padded, nonzeroRows=image.shape[0]), np.float32)
 
     def best(self, yaw: float) -> Pose | None:
         """Return the best shift under one yaw, if any overlap is large enough."""

@@ -1,7 +1,8 @@
 """Lengths that follow from the data: density, extent and overlap decide, between limits written down here.
 
 No length in metres decides anything by itself: a plot of 20 m and a tile of kilometres go through the same
-rules. Cells are chosen by `mtpcr_geo.method.bev.choose_cell`, the rest here. The extent that counts is that of the smaller cloud, as the edge of a square of its occupied area.
+rules. Cells are chosen by `mtpcr_geo.method.bev.choose_cell`, the rest here. The extent that counts is that of
+the smaller cloud, as the edge of a square of its occupied area.
 
 ==================  =======================================  ===============
 length              rule                                     limits
