@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import struct
 from collections.abc import Iterator
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 from mtpcr_geo.core.errors import InputError
+from mtpcr_geo.core.system import sha256
 from mtpcr_geo.io.dimensions import las_table, noise_of_record
 from mtpcr_geo.io.vlr import Record, crs_of_records, read_records
 
@@ -246,12 +246,6 @@ def _reported(path: Path) -> Iterator[None]:
 def _damaged(path: Path, error: BaseException) -> InputError:
     detail = (str(error).splitlines() or [type(error).__name__])[0]
     return InputError(f"{path} is truncated or damaged ({detail}); copy or download it again")
-
-
-def sha256(path: str | Path) -> str:
-    """Hash a file's content, as 64 hexadecimal digits."""
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def check_distinct(target: Cloud, source: Cloud) -> None:

@@ -21,7 +21,7 @@ from mtpcr_geo.io.waveform import append_waveforms
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from mtpcr_geo.pipeline.stage import Progress
+    from mtpcr_geo.core.progress import Progress
 
 Floats = NDArray[np.float64]
 Move = Callable[[Floats], Floats]
@@ -129,6 +129,8 @@ def _write_las(path: Path, header: laspy.LasHeader, chunks: Iterator[NDArray[Any
             writer.write_points(laspy.PackedPointRecord(chunk, header.point_format))
         if header.evlrs:
             writer.write_evlrs(header.evlrs)
+        # the writer has a copy of the header, which it writes again when it closes
+        writer.header.global_encoding.gps_time_type = header.global_encoding.gps_time_type
 
 
 def _of_one_channel(chunks: Iterator[NDArray[Any]]) -> Iterator[NDArray[Any]]:
