@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mtpcr_geo.check.findings import Finding, Role, rewrite
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.io.vlr import GEOKEYS, WKT_RECORD, crs_of_records
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from mtpcr_geo.crs import CrsFacts
     from mtpcr_geo.io.las import LasCloud
 
@@ -190,7 +189,7 @@ def _counts(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Finding]:
             )
 
 
-def scales_in_metres(scales: NDArray[np.float64], facts: CrsFacts) -> NDArray[np.float64]:
+def scales_in_metres(scales: Floats, facts: CrsFacts) -> Floats:
     """Return the size of a file's last digits in metres, (3,)."""
     plan = facts.unit * (METRES_A_DEGREE if facts.kind == "geographic" else 1.0)
     return np.asarray(scales, np.float64) * [plan, plan, facts.height_unit]
@@ -298,7 +297,7 @@ def _times(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Finding]:
         )
 
 
-def _first_times(cloud: LasCloud, count: int = 10_000) -> NDArray[np.float64] | None:
+def _first_times(cloud: LasCloud, count: int = 10_000) -> Floats | None:
     from laspy import DecompressionSelection as Fields
 
     from mtpcr_geo.core.errors import InputError
@@ -313,5 +312,5 @@ def _first_times(cloud: LasCloud, count: int = 10_000) -> NDArray[np.float64] | 
     return times if np.isfinite(times).all() else None
 
 
-def _triple(values: NDArray[np.float64]) -> str:
+def _triple(values: Floats) -> str:
     return f"({', '.join(f'{value + 0.0:g}' for value in values)})"

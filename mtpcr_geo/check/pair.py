@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.check.findings import Finding
 from mtpcr_geo.check.place import EXCHANGE, area_findings, exchanged, within_area
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.crs.resolve import FARTHEST_APART
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from mtpcr_geo.crs import FrameLink
     from mtpcr_geo.method.overlap import Overlap
 
-Floats = NDArray[np.float64]
 
 MOST_CELLS = 4_000_000
 LITTLE_OVERLAP_M2 = 400.0

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.check.findings import Finding, Role
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError
 from mtpcr_geo.core.frames import box_points
 from mtpcr_geo.crs import CrsFacts, facts_of, parse_crs, same_place
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from mtpcr_geo.io.las import LasCloud
 
-Floats = NDArray[np.float64]
 # grids are used a little beyond their area, and neighbouring zones for one another; they do not break there
 BEYOND_AREA_DEG, NEIGHBOUR_DEG = 0.5, 6.0
 EXCHANGE = "exchange them, for example with PDAL's filters.ferry, or name the CRS that has them so"

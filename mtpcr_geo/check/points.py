@@ -7,16 +7,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.check.findings import Finding, Role, rewrite
+from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 
 if TYPE_CHECKING:
     from mtpcr_geo.io.las import LasCloud
     from mtpcr_geo.io.sample import Scan
 
-Floats = NDArray[np.float64]
 
 SPARSE_PER_M2, VERY_SPARSE_PER_M2 = 0.5, 0.1
 FEW_POINTS = 10_000
@@ -42,7 +41,7 @@ class Watched(Cloud):
         """Stream all dimensions."""
         yield from self.cloud.table_chunks(size)
 
-    def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, NDArray[np.bool_]]]:
+    def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, Mask]]:
         """Stream coordinates and what is noise, and note the bounds."""
         for xyz, noise in self.cloud.noise_chunks(size):
             np.fmin(self.seen_minimum, np.fmin.reduce(xyz, axis=0), out=self.seen_minimum)

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.check import header, pair, place, points
 from mtpcr_geo.check.describe import describe
 from mtpcr_geo.check.findings import CloudRole, Finding, Role, by_severity, finding_of
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError, InputError, MtpcrError, OptionError, RegistrationError
 from mtpcr_geo.core.frames import box_points
 from mtpcr_geo.crs import FrameLink, WorkFrame, resolve_frames
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from mtpcr_geo.crs import Vertical
     from mtpcr_geo.method.overlap import Overlap
 
-Floats = NDArray[np.float64]
 Frames = tuple[WorkFrame, FrameLink, FrameLink]
 
 

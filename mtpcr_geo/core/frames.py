@@ -8,14 +8,12 @@ from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError
 
 if TYPE_CHECKING:
     from pyproj import CRS, Transformer
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

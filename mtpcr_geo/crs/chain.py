@@ -6,16 +6,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.frames import FrameLink, box_points, fit_affine
 from mtpcr_geo.crs.facts import facts_of
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.types import Pair
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError
 
 if TYPE_CHECKING:
@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from pyproj.transformer import AreaOfInterest
 
     from mtpcr_geo.crs.facts import CrsFacts
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError, InputError
 from mtpcr_geo.core.frames import FrameLink, WorkFrame, box_points, run_pipeline
 from mtpcr_geo.crs.facts import CrsFacts, facts_of, metric, same_datum, same_heights, same_place, unbound
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from mtpcr_geo.core.cloud import Cloud
 
-Floats = NDArray[np.float64]
 Vertical = Literal["refuse", "assume-same", "estimate"]
 LOCAL = "local"
 SCALE_NOTED, SCALE_REFUSED = 0.002, 0.01  # departure of a map's metre from a metre on the ground

@@ -8,9 +8,8 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.export import drawing
-
-Floats = NDArray[np.float64]
 
 _WIDTH = 640
 
@@ -40,7 +39,7 @@ def bars(values: Sequence[float], labels: Sequence[str], notes: Sequence[str] = 
     return _svg(_WIDTH, max(len(values), 1) * row, parts)
 
 
-def histogram(residual_m: Floats, inlier: NDArray[np.bool_], limit_m: float, bins: int = 32) -> str:
+def histogram(residual_m: Floats, inlier: Mask, limit_m: float, bins: int = 32) -> str:
     """Draw how many tie points have which residual: agreeing ones green, the others red, stacked.
 
     Args:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.types import Floats, Pair, Side, Verdict
+from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.types import Pair, Side, Verdict
 from mtpcr_geo.crs import FrameLink, TransformChain, facts_of
 from mtpcr_geo.export.tie_points import tie_positions
 from mtpcr_geo.export.transform import units_of

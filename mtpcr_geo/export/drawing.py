@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats, Image, Mask
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Pair
 from mtpcr_geo.export.geotiff import grid_around, warp_bev
 
-Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 SOURCE_RGB = (240, 120, 20)
@@ -27,7 +27,7 @@ _LOCAL_MEAN_M = 12.0
 _GREY_PER_METRE = 20.0
 
 
-def band_grey(top: NDArray[np.float32], cell: float) -> Picture:
+def band_grey(top: Image, cell: float) -> Picture:
     """Show band-passed height: 127 + 20 per metre above the surroundings, 127 where empty.
 
     Args:
@@ -46,7 +46,7 @@ def band_grey(top: NDArray[np.float32], cell: float) -> Picture:
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
 
 
-def hillshade(top: NDArray[np.float32], cell: float) -> Picture:
+def hillshade(top: Image, cell: float) -> Picture:
     """Shade heights as if lit from north-west, softened by light from the sides; 0 where empty.
 
     Args:
@@ -72,7 +72,7 @@ def hillshade(top: NDArray[np.float32], cell: float) -> Picture:
     return np.where(filled, np.clip(1.0 + 254.0 * light, 1, 255), 0).astype(np.uint8)
 
 
-def shaded_relief(top: NDArray[np.float32], cell: float) -> Picture:
+def shaded_relief(top: Image, cell: float) -> Picture:
     """Show heights as colour under a hillshade; dark where empty. Returns (h, w, 3)."""
     filled = np.isfinite(top)
     colour = height_colours(np.where(filled, top, 0.0), *height_range(top[filled]))
@@ -81,7 +81,7 @@ def shaded_relief(top: NDArray[np.float32], cell: float) -> Picture:
     return np.where(filled[..., None], np.clip(lit, 0, 255), np.array(EMPTY_RGB)).astype(np.uint8)
 
 
-def thinned(bev: Bev, max_side: int) -> tuple[NDArray[np.float32], float, int]:
+def thinned(bev: Bev, max_side: int) -> tuple[Image, float, int]:
     """Return a BEV's heights with at most `max_side` cells a side: every n-th cell, its edge, and n."""
     step = max(1, -(-max(bev.grid.shape) // max_side))
     return bev.top[::step, ::step], bev.grid.cell * step, step
@@ -113,7 +113,7 @@ def residual_colours(residual_m: Floats, good_m: float, bad_m: float) -> Picture
     return np.asarray(np.rint(np.stack(mixed, axis=-1)), np.uint8)
 
 
-def residual_limits(residual_m: Floats, inlier: NDArray[np.bool_]) -> tuple[float, float]:
+def residual_limits(residual_m: Floats, inlier: Mask) -> tuple[float, float]:
     """Return where green ends and red begins, from the inliers' own spread, in whole centimetres."""
     if not inlier.any():
         return 0.1, 0.5
@@ -240,7 +240,7 @@ def common_rasters(pair: Pair, margin_m: float = 15.0, max_side: int = 1600) -> 
     return warp_bev(source, T, grid), warp_bev(target, np.eye(4), grid)
 
 
-def _crop(grid: Grid, mask: NDArray[np.bool_]) -> Grid:
+def _crop(grid: Grid, mask: Mask) -> Grid:
     """Cut a grid down to the rows and columns in which a mask holds."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     west = grid.west + float(columns[0]) * grid.cell
@@ -282,7 +282,7 @@ def checkerboard(source: Bev, target: Bev, tile_m: float = 20.0) -> Picture:
     return np.asarray(np.clip(np.where(of_source, tints[0], tints[1]), 0, 255), np.uint8)
 
 
-def step_edges(top: NDArray[np.float32]) -> Floats:
+def step_edges(top: Image) -> Floats:
     """Return height steps as (h, w) 0..1: the range within 3x3 filled cells, from 1 m (0) to 4 m (1)."""
     import cv2
 
@@ -330,9 +330,7 @@ def _rgb(picture: Picture) -> Picture:
     return np.repeat(picture[..., None], 3, axis=2) if picture.ndim == 2 else picture
 
 
-def _masked_blur(
-    top: NDArray[np.float32], filled: NDArray[np.bool_], sigma: float, fill: bool = False
-) -> NDArray[np.float32]:
+def _masked_blur(top: Image, filled: Mask, sigma: float, fill: bool = False) -> Image:
     """Gaussian over filled cells only; with `fill` empty cells take their neighbourhood's mean."""
     import cv2
 
@@ -348,7 +346,7 @@ def _masked_blur(
     return np.asarray(smooth, np.float32)
 
 
-def _masked_mean(top: NDArray[np.float32], filled: NDArray[np.bool_], size: int) -> NDArray[np.float32]:
+def _masked_mean(top: Image, filled: Mask, size: int) -> Image:
     """Mean of the filled cells in a square of `size` cells; the overall median where there are none."""
     import cv2
 

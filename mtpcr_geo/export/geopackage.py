@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import OutputError
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-Floats = NDArray[np.float64]
 Kind = Literal["POINT", "LINESTRING", "POLYGON"]
 
 _APPLICATION_ID = 0x47504B47  # "GPKG"

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from mtpcr_geo import __version__
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats, Image, Mask
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Pair, Side
 from mtpcr_geo.crs import WorkFrame
-
-Floats = NDArray[np.float64]
 
 BANDS = (
     ("highest z in the cell, metres", "metre"),
@@ -219,8 +218,8 @@ def warp_bev(bev: Bev, T_to_bev: Floats, grid: Grid) -> Bev:
 
 
 def _look_back(
-    bev: Bev, filled: NDArray[np.bool_], T_to_bev: Floats, plan: Floats, height: float
-) -> tuple[NDArray[np.bool_], Floats, NDArray[np.int64]]:
+    bev: Bev, filled: Mask, T_to_bev: Floats, plan: Floats, height: float
+) -> tuple[Mask, Floats, NDArray[np.int64]]:
     """Find the BEV's cell for each of (n, 2) places: found or not, (n, 3) place in the BEV, flat index."""
     T_bev_to = transforms.inverse(T_to_bev)
     z_to = np.full(len(plan), (T_to_bev @ np.array([0.0, 0.0, height, 1.0]))[2])
@@ -255,12 +254,12 @@ def overview_factors(grid: Grid) -> list[int]:
     return factors
 
 
-def _move_z(T: Floats, xyz: Floats, z: NDArray[np.float32]) -> Floats:
+def _move_z(T: Floats, xyz: Floats, z: Image) -> Floats:
     """Heights after T of points with the plan position of `xyz` and height `z`."""
     return np.asarray(T[2, 0] * xyz[:, 0] + T[2, 1] * xyz[:, 1] + T[2, 2] * z + T[2, 3])
 
 
-def _absolute(z: NDArray[np.float32], frame: WorkFrame) -> NDArray[np.float32]:
+def _absolute(z: Image, frame: WorkFrame) -> Image:
     return (z.astype(np.float64) + float(frame.origin[2])).astype(np.float32)
 
 

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.export import styles
 from mtpcr_geo.export.geopackage import Layer, write_geopackage
 
-Floats = NDArray[np.float64]
 Fields = dict[str, NDArray[Any]]
 
 _FOOTPRINT_POINTS = 40_000

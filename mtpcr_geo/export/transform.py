@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.core.frames import FrameLink
 from mtpcr_geo.crs.chain import TransformChain
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from mtpcr_geo.core.types import Pair
 
-Floats = NDArray[np.float64]
 KIND, VERSION = "mtpcr-geo transform", 1
 _SHARED_SHIFT = 10_000.0  # beyond this, single precision would show in one common shift
 _EARTH_RADIUS = 6_371_000.0

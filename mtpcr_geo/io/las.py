@@ -13,8 +13,8 @@ import laspy
 import lazrs
 import numpy as np
 from laspy import DecompressionSelection as Fields
-from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.core.system import sha256
@@ -96,7 +96,7 @@ class LasCloud(Cloud):
                 left -= len(record)
                 yield record
 
-    def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[NDArray[np.float64]]:
+    def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
         """Yield (n, 3) float64 coordinates in the file's CRS and units, n <= size.
 
         Raises:
@@ -106,9 +106,7 @@ class LasCloud(Cloud):
         for record in self.record_chunks(size, _XYZ):
             yield xyz_of(record)
 
-    def noise_chunks(
-        self, size: int = CHUNK_POINTS
-    ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
+    def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, Mask]]:
         """Yield coordinates (n, 3) and which of them are noise or withheld (n,)."""
         for record in self.record_chunks(size, _XYZ_AND_CLASS):
             yield xyz_of(record), noise_of_record(record)
@@ -119,7 +117,7 @@ class LasCloud(Cloud):
             yield las_table(record, xyz_of(record))
 
 
-def xyz_of(record: Any) -> NDArray[np.float64]:
+def xyz_of(record: Any) -> Floats:
     """Return the (n, 3) float64 coordinates of a laspy point record."""
     xyz = np.empty((len(record), 3))
     for axis, name in enumerate("XYZ"):

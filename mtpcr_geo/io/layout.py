@@ -180,7 +180,7 @@ def _table_layout(cloud: Cloud) -> tuple[laspy.LasHeader, Iterator[Chunk]]:
 
 def _is_standard_time(table: PointTable) -> bool:
     """Return whether some time is no second of a week (0-604800), so that it is standard GPS time."""
-    time = np.asarray(table.get("GpsTime", [0.0]))
+    time = np.asarray(table.get("GpsTime", [0.0]), np.float64)
     return bool(((time < 0) | (time > _WEEK)).any())
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud
 from mtpcr_geo.core.errors import InputError
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 BUDGET = 4_000_000
 FEWEST_POINTS = 100
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

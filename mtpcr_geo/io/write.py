@@ -12,6 +12,7 @@ import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.io.las import LasCloud
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 
     from mtpcr_geo.core.progress import Progress
 
-Floats = NDArray[np.float64]
 Move = Callable[[Floats], Floats]
 STEP, FINEST_STEP = 0.001, 0.0001  # metres or feet
 DEGREE_STEP = 1e-9  # a tenth of a millimetre, and 32 bits still span four degrees

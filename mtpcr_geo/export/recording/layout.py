@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mtpcr_geo.core.types import Floats
+from mtpcr_geo.core.arrays import Floats
 
 TIMELINE = "stage"
 
