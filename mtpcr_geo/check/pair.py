@@ -227,20 +227,20 @@ def in_feet(source: Floats, target: Floats) -> tuple[float, Literal["source", "t
 
 def link_findings(source: FrameLink, target: FrameLink) -> Iterator[Finding]:
     """Say by which operation the source comes to the target's frame, if by any."""
-    if source.pipeline is not None and source.file_crs is not None and target.file_crs is not None:
-        accuracy = source.report.get("accuracy_m")
-        grids = ", ".join(source.report.get("grids") or ())
+    report = source.report
+    if source.pipeline is not None and source.georeferenced and target.georeferenced:
+        accuracy = report.accuracy_m
+        grids = ", ".join(report.grids)
         yield Finding(
             "note",
             "crs-different",
             "both",
-            f"they are in different CRSs; the source comes to the target's by {source.report['operation']} "
+            f"they are in different CRSs; the source comes to the target's by {report.operation} "
             f"({f'accuracy {accuracy:g} m' if accuracy is not None else 'accuracy not stated'}"
             f"{f', grids {grids}' if grids else ''})",
         )
-    for note in source.report.get("notes", ()):
-        if note.startswith("heights differ"):
-            yield Finding("note", "vertical-taken", "both", note)
+    for note in report.height_notes:
+        yield Finding("note", "vertical-taken", "both", note)
 
 
 def swapped_findings(source: Inspection, target: Inspection) -> Iterator[Finding]:

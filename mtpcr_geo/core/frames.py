@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -16,7 +16,11 @@ if TYPE_CHECKING:
     from pyproj import CRS, Transformer
 
 
-@dataclass(frozen=True)
+Vertical = Literal["refuse", "assume-same", "estimate"]
+"""What to do where two clouds' heights have different or unknown vertical datums."""
+
+
+@dataclass(frozen=True, eq=False)
 class WorkFrame:
     """The frame of all computation: a projected metric CRS, shifted to an integer origin.
 
@@ -33,6 +37,49 @@ class WorkFrame:
 
 
 @dataclass(frozen=True)
+class OperationReport:
+    """How a file's coordinates come to the work frame, and what had to be assumed for it.
+
+    Attributes:
+        operation: name of the coordinate operation, as in the EPSG registry.
+        accuracy_m: its accuracy in metres, or None where nobody stated one.
+        grids: names of the grid files that it uses.
+        heights: what the file's heights refer to.
+        vertical: what was to be done with different or unknown vertical datums.
+        height_notes: how heights of different or unknown datums were taken, a sentence each.
+        unit_notes: what had to be assumed of units and scale, a sentence each.
+        grid_scale: least and greatest length, on the map, of a metre on the ground; None where not known.
+
+    """
+
+    operation: str = "units only"
+    accuracy_m: float | None = 0.0
+    grids: tuple[str, ...] = ()
+    heights: str = "heights of no stated datum"
+    vertical: Vertical = "assume-same"
+    height_notes: tuple[str, ...] = ()
+    unit_notes: tuple[str, ...] = ()
+    grid_scale: tuple[float, float] | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """All that had to be assumed, a sentence each."""
+        return (*self.unit_notes, *self.height_notes)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what goes into ``transform.json`` and ``run.json``; a grid scale only where it is known."""
+        known: dict[str, Any] = {
+            "operation": self.operation,
+            "accuracy_m": self.accuracy_m,
+            "grids": list(self.grids),
+            "heights": self.heights,
+            "vertical": self.vertical,
+            "notes": list(self.notes),
+        }
+        return known if self.grid_scale is None else known | {"grid_scale": list(self.grid_scale)}
+
+
+@dataclass(frozen=True, eq=False)
 class FrameLink:
     """The way between a file's coordinates and work coordinates of its side.
 
@@ -46,6 +93,8 @@ class FrameLink:
         pipeline: PROJ pipeline from the file's CRS to the work frame's, or None.
         bounds: (2, 3) file coordinates in which the link is used; needed with a pipeline only.
         report: the operation by name, its accuracy and grids, and what had to be assumed.
+        georeferenced: whether the file's CRS is tied to the earth, so that its vertical and its place are
+            known. False for local coordinates, and for an engineering CRS, which has a name but no place.
 
     """
 
@@ -54,7 +103,8 @@ class FrameLink:
     factor: Floats = field(default_factory=lambda: np.ones(3))
     pipeline: str | None = None
     bounds: Floats | None = None
-    report: dict[str, Any] = field(default_factory=dict)
+    report: OperationReport = field(default_factory=OperationReport)
+    georeferenced: bool = False
 
     def to_work(self, xyz: Floats) -> Floats:
         """Take (n, 3) file coordinates to (n, 3) work coordinates in metres.

@@ -10,13 +10,12 @@ import numpy as np
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.frames import FrameLink, box_points, fit_affine
-from mtpcr_geo.crs.facts import facts_of
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.types import Pair
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TransformChain:
     """A registration's result, ready to move points either way without losing digits far from the origin.
 
@@ -67,7 +66,7 @@ class TransformChain:
     @property
     def shift_m(self) -> Floats | None:
         """(3,) metres by which the pivot leaves the place that its CRS claims; None for a local source."""
-        if any(facts_of(link.file_crs).kind == "local" for link in (self.source, self.target)):
+        if not (self.source.georeferenced and self.target.georeferenced):
             return None
         before = self.source.to_work(self.pivot[None])
         after = transforms.apply(self.T_target_source, before)
@@ -77,7 +76,7 @@ class TransformChain:
     def vertical_offset_m(self) -> float | None:
         """Metres added to the source's heights, where that was to be estimated; None elsewhere."""
         shift = self.shift_m
-        if shift is None or self.source.report.get("vertical") != "estimate":
+        if shift is None or self.source.report.vertical != "estimate":
             return None
         return float(shift[2])
 

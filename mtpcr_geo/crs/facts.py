@@ -49,6 +49,11 @@ class CrsFacts:
         return "local coordinates" if self.crs is None else self.crs.name
 
     @property
+    def georeferenced(self) -> bool:
+        """Return whether it is tied to the earth: neither local coordinates nor an engineering system."""
+        return self.kind != "local"
+
+    @property
     def height_name(self) -> str:
         """What its heights refer to, in words."""
         if self.vertical is not None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError
+from mtpcr_geo.core.frames import OperationReport
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -36,9 +37,9 @@ class Operation:
     grids: tuple[str, ...]
 
     @property
-    def report(self) -> dict[str, Any]:
-        """The operation in words and numbers, for the record."""
-        return {"operation": self.name, "accuracy_m": self.accuracy, "grids": list(self.grids)}
+    def report(self) -> OperationReport:
+        """The operation by name, accuracy and grids, for the audit."""
+        return OperationReport(self.name, self.accuracy, self.grids)
 
 
 def best_operation(start: CRS, end: CRS, area: AreaOfInterest | None) -> Operation:

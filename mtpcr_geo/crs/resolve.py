@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError, InputError
-from mtpcr_geo.core.frames import FrameLink, WorkFrame, box_points, run_pipeline
+from mtpcr_geo.core.frames import FrameLink, OperationReport, Vertical, WorkFrame, box_points, run_pipeline
 from mtpcr_geo.crs.facts import CrsFacts, facts_of, metric, same_datum, same_heights, same_place, unbound
 from mtpcr_geo.crs.operation import area_of, best_operation, grid_scale, local_projection
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from mtpcr_geo.core.cloud import Cloud
 
-Vertical = Literal["refuse", "assume-same", "estimate"]
 LOCAL = "local"
 SCALE_NOTED, SCALE_REFUSED = 0.002, 0.01  # departure of a map's metre from a metre on the ground
 FARTHEST_APART = 100_000.0  # metres between the bounds of two clouds that both claim a place on earth
@@ -88,14 +87,14 @@ def resolve_frames(
 
     work = _work_crs(target_facts, target_bounds)
     target_link = _link(target_facts, work, target_facts, target_bounds, "assume-same")
-    if target_facts.kind == "local" or source_facts.kind == "local":
+    if not (target_facts.georeferenced and source_facts.georeferenced):
         source_work = _work_crs(source_facts, source_bounds)
         source_link = _link(source_facts, source_work, source_facts, source_bounds, "assume-same")
-        _note_scale(source_link, source_facts, source_work, beside_local=True)
-        _note_scale(target_link, target_facts, work, beside_local=True)
+        source_link = _with_scale(source_link, source_facts, source_work, beside_local=True)
+        target_link = _with_scale(target_link, target_facts, work, beside_local=True)
     else:
         source_link = _link(source_facts, work, target_facts, source_bounds, vertical)
-        _note_scale(target_link, target_facts, work, beside_local=False)
+        target_link = _with_scale(target_link, target_facts, work, beside_local=False)
         _require_near(target_link, source_link)
     frame = WorkFrame(None if work is None else unbound(work), target_link.origin)
     if out_crs is not None:
@@ -148,19 +147,25 @@ def _link(
     """Find the way from a cloud's CRS to the horizontal work CRS and the heights of another CRS."""
     factor = np.array([facts.unit, facts.unit, facts.height_unit])
     pipeline: str | None = None
-    report: dict[str, Any] = {"operation": "units only", "accuracy_m": 0.0, "grids": []}
-    notes = _unit_notes(facts)
+    report = OperationReport()
+    height_notes: list[str] = []
     if work is not None and facts.horizontal is not None:
-        agree = _heights_agree(facts, heights, vertical, notes)
+        agree = _heights_agree(facts, heights, vertical, height_notes)
         start, end, solid = _ends(facts, work, heights, agree)
         if solid or facts.kind != "projected" or not same_place(metric(facts.horizontal), work):
             operation = best_operation(start, end, area_of(facts, box_points(bounds, 2)))
             pipeline, report = operation.pipeline, operation.report
             factor = np.ones(3) if solid else np.array([1.0, 1.0, facts.height_unit])
     if factor[:2].tolist() == [1.0, 1.0] and factor[2] == 1.0 and pipeline is None:
-        report["operation"] = "none: the file is in the work frame's metres"
-    report |= {"heights": facts.height_name, "vertical": vertical, "notes": notes}
-    link = FrameLink(facts.crs, np.zeros(3), factor, pipeline, bounds, report)
+        report = replace(report, operation="none: the file is in the work frame's metres")
+    report = replace(
+        report,
+        heights=facts.height_name,
+        vertical=vertical,
+        height_notes=tuple(height_notes),
+        unit_notes=_unit_notes(facts),
+    )
+    link = FrameLink(facts.crs, np.zeros(3), factor, pipeline, bounds, report, facts.georeferenced)
     return replace(link, origin=_origin(link, bounds))
 
 
@@ -201,10 +206,10 @@ def _heights_agree(facts: CrsFacts, other: CrsFacts, vertical: Vertical, notes: 
     return False
 
 
-def _unit_notes(facts: CrsFacts) -> list[str]:
-    if facts.crs is None or facts.height != "unsaid" or facts.kind == "local":
-        return []
-    return [f"the CRS states no unit of height: taken as {facts.height_unit_name}"]
+def _unit_notes(facts: CrsFacts) -> tuple[str, ...]:
+    if facts.height != "unsaid" or not facts.georeferenced:
+        return ()
+    return (f"the CRS states no unit of height: taken as {facts.height_unit_name}",)
 
 
 def _origin(link: FrameLink, bounds: Floats) -> Floats:
@@ -217,29 +222,32 @@ def _origin(link: FrameLink, bounds: Floats) -> Floats:
     return np.asarray(np.floor(middle + 0.123456))
 
 
-def _note_scale(link: FrameLink, facts: CrsFacts, work: CRS | None, beside_local: bool) -> None:
-    """Record how true the metres of the work frame are; a local cloud has true ones, which must go with them.
+def _with_scale(link: FrameLink, facts: CrsFacts, work: CRS | None, beside_local: bool) -> FrameLink:
+    """Add to a link's report how true the metres of the work frame are.
+
+    A local cloud has metres of the ground, which must go with them.
 
     Raises:
         CrsError: if a local cloud would have to be stretched.
 
     """
     if work is None or facts.kind != "projected" or link.bounds is None:
-        return
+        return link
     area = area_of(facts, box_points(link.bounds, 2))
     scale = None if area is None else grid_scale(unbound(work), area)
     if scale is None:
-        return
-    link.report["grid_scale"] = list(scale)
+        return link
     worst = max(scale, key=lambda one: abs(one - 1.0))
-    said = f"a metre on the ground is {worst:.4f} m in {facts.name} here"
+    stretch = f"a metre on the ground is {worst:.4f} m in {facts.name} here"
     if beside_local and abs(worst - 1.0) > SCALE_REFUSED:
         raise CrsError(
-            f"{said}, and a local cloud has metres of the ground: no rigid transform fits both; "
+            f"{stretch}, and a local cloud has metres of the ground: no rigid transform fits both; "
             "reproject the other one to a system of true scale, such as its UTM zone"
         )
+    notes = link.report.unit_notes
     if abs(worst - 1.0) > SCALE_NOTED:
-        link.report["notes"].append(f"{said}: distances in metres are off by that")
+        notes = (*notes, f"{stretch}: distances in metres are off by that")
+    return replace(link, report=replace(link.report, unit_notes=notes, grid_scale=scale))
 
 
 def _require_near(target: FrameLink, source: FrameLink) -> None:

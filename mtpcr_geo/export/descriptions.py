@@ -121,8 +121,9 @@ def shift_text(pair: Pair) -> str:
     shift = chain.shift_m
     if shift is not None and pair.frame.crs is not None:
         return f"{_numbers(shift, 3, sign=True)} m (east, north, up in {pair.frame.crs.name})"
-    if pair.source.link.file_crs is None and pair.target.link.file_crs is None:
-        shift = chain.forward(chain.pivot[None])[0] - chain.pivot
+    if not (pair.source.link.georeferenced or pair.target.link.georeferenced):
+        moved = chain.forward(chain.pivot[None])[0]
+        shift = moved * chain.target.factor - chain.pivot * chain.source.factor
         return f"{_numbers(shift, 3, sign=True)} m (x, y, z)"
     return ""
 
@@ -137,13 +138,11 @@ def result_text(pair: Pair) -> str:
 def _way_rows(link: FrameLink) -> list[Row]:
     """Say how a file's coordinates come to the work frame, and what had to be assumed."""
     report = link.report
-    rows = []
-    if "operation" in report:
-        accuracy = report.get("accuracy_m")
-        how = "accuracy not stated" if accuracy is None else f"good to {accuracy:g} m"
-        grids = ", ".join(report.get("grids", ()))
-        rows.append(("way to the work frame", f"{report['operation']} ({how}{'; ' if grids else ''}{grids})"))
-    return rows + [("note", note) for note in report.get("notes", ())]
+    accuracy = report.accuracy_m
+    how = "accuracy not stated" if accuracy is None else f"good to {accuracy:g} m"
+    details = "; ".join([how, *report.grids])
+    rows = [("way to the work frame", f"{report.operation} ({details})")]
+    return rows + [("note", note) for note in report.notes]
 
 
 def worked_example(pair: Pair) -> tuple[Floats, Floats] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Pair, Side
 from mtpcr_geo.crs import WorkFrame
+from mtpcr_geo.export import overviews
 
 BANDS = (
     ("highest z in the cell, metres", "metre"),
@@ -40,7 +41,8 @@ def write_bev(
     """Write a BEV as a tiled, compressed float32 GeoTIFF with overviews.
 
     Bands: highest z, lowest z (both absolute: the origin's z is added; NaN is nodata) and the number of
-    points (0 where empty). Cell edges, not centres, carry the geotransform (AREA_OR_POINT=Area).
+    points (0 where empty). Cell edges, not centres, carry the geotransform (AREA_OR_POINT=Area). A cell of
+    an overview has the highest, the lowest and the number of points of all the cells that it covers.
 
     Args:
         path: where to write; no other file is left beside it.
@@ -56,8 +58,8 @@ def write_bev(
 
     """
     import rasterio
-    from rasterio.enums import Resampling
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
+    from rasterio.io import MemoryFile
 
     level = np.eye(4) if T_level_work is None else np.asarray(T_level_work, np.float64)
     upright = bool(np.array_equal(level, np.eye(4)))
@@ -71,6 +73,8 @@ def write_bev(
         "nodata": float("nan"),
         "transform": geotransform(grid, frame.origin),
         "crs": frame.crs.to_wkt() if frame.crs is not None and upright else None,
+    }
+    creation: dict[str, Any] = {
         "tiled": True,
         "blockxsize": _TILE,
         "blockysize": _TILE,
@@ -93,20 +97,27 @@ def write_bev(
         with rasterio.Env(GDAL_PAM_ENABLED="NO"), warnings.catch_warnings():
             # a local raster with its corner at zero is georeferenced all the same
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path, "w", **profile) as out:
-                out.update_tags(**every_tag)
-                for index, (text, unit) in enumerate(BANDS, start=1):
-                    out.set_band_description(index, text)
-                    out.set_band_unit(index, unit)
-                out.write(_absolute(bev.top, frame), 1)
-                out.write(_absolute(bev.low, frame), 2)
-                out.write(bev.count.astype(np.float32), 3)
-            factors = overview_factors(grid)
-            if factors:
-                with rasterio.open(path, "r+") as out:
-                    out.build_overviews(factors, Resampling.average)
+            bands = [_absolute(bev.top, frame), _absolute(bev.low, frame), bev.count.astype(np.float32)]
+            levels = overview_levels(grid)
+            if not levels:
+                with rasterio.open(path, "w", **profile, **creation) as out:
+                    _fill(out, bands, every_tag)
+            else:
+                with MemoryFile(ext=".tif") as memory:
+                    with memory.open(**profile, **creation | {"zlevel": 1}) as out:
+                        _fill(out, bands, every_tag)
+                    pools = [overviews.HIGHEST, overviews.LOWEST, overviews.SUM]
+                    overviews.copy_with_overviews(memory.name, Path(path), bands, pools, levels, **creation)
     except (RasterioError, OSError) as error:
         raise OutputError(f"cannot write the raster {Path(path)}: {error}") from error
+
+
+def _fill(out: Any, bands: Sequence[Image], tags: Mapping[str, str]) -> None:
+    out.update_tags(**tags)
+    for index, (band, (text, unit)) in enumerate(zip(bands, BANDS, strict=True), start=1):
+        out.set_band_description(index, text)
+        out.set_band_unit(index, unit)
+        out.write(band, index)
 
 
 def write_side_bev(path: str | os.PathLike[str], side: Side, frame: WorkFrame | None = None) -> None:
@@ -244,14 +255,12 @@ def geotransform(grid: Grid, origin: Floats) -> Any:
     )
 
 
-def overview_factors(grid: Grid) -> list[int]:
-    """Return the powers of two at which a raster of this size deserves overviews."""
-    factors = []
-    factor = 2
-    while max(grid.width, grid.height) / factor >= _SMALLEST_OVERVIEW:
-        factors.append(factor)
-        factor *= 2
-    return factors
+def overview_levels(grid: Grid) -> int:
+    """Return how often a raster of this size is worth halving: until its longer side is below 256 cells."""
+    levels = 0
+    while max(grid.width, grid.height) / 2 ** (levels + 1) >= _SMALLEST_OVERVIEW:
+        levels += 1
+    return levels
 
 
 def _move_z(T: Floats, xyz: Floats, z: Image) -> Floats:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import InputError
-from mtpcr_geo.core.frames import FrameLink
+from mtpcr_geo.core.frames import FrameLink, OperationReport, Vertical
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.crs.facts import facts_of
 
@@ -175,7 +175,7 @@ def frames_of(pair: Pair) -> dict[str, Any]:
     links = {"source": pair.source.link, "target": pair.target.link}
     links["result"] = pair.frame.output or pair.target.link
     frames: dict[str, Any] = {
-        role: {"crs": _crs(link.file_crs, wkt=False), "units": units_of(link), **link.report}
+        role: {"crs": _crs(link.file_crs, wkt=False), "units": units_of(link), **link.report.as_dict()}
         for role, link in links.items()
     }
     frames["work"] = {
@@ -235,7 +235,7 @@ def _motion(chain: TransformChain) -> dict[str, Any]:
     shift = chain.shift_m
     if shift is not None:
         motion["shift_of_pivot_m"] = shift
-        motion["vertical"] = chain.source.report.get("vertical", "")
+        motion["vertical"] = chain.source.report.vertical
         if chain.vertical_offset_m is not None:
             motion["vertical_offset_m"] = chain.vertical_offset_m
     return motion
@@ -243,8 +243,6 @@ def _motion(chain: TransformChain) -> dict[str, Any]:
 
 def units_of(link: FrameLink) -> list[str]:
     """Name the units of x, y and z in a file."""
-    if link.file_crs is None:
-        return ["metre"] * 3
     facts = facts_of(link.file_crs)
     return [facts.unit_name, facts.unit_name, facts.height_unit_name]
 
@@ -265,7 +263,7 @@ def _link(link: FrameLink) -> dict[str, Any]:
         "factor": link.factor,
         "origin": link.origin,
         "bounds": link.bounds,
-        "report": link.report,
+        "report": link.report.as_dict(),
     }
 
 
@@ -288,7 +286,24 @@ def _read_link(data: Mapping[str, Any]) -> FrameLink:
         factor=_array(data["factor"], (3,)),
         pipeline=pipeline,
         bounds=None if data["bounds"] is None else _array(data["bounds"], (2, 3)),
-        report=dict(data["report"]),
+        report=_read_report(data["report"]),
+        georeferenced=facts_of(crs).georeferenced,
+    )
+
+
+def _read_report(data: Mapping[str, Any]) -> OperationReport:
+    vertical: Vertical | None = next((one for one in get_args(Vertical) if one == data["vertical"]), None)
+    if vertical is None:
+        raise ValueError(f"vertical is {data['vertical']!r}")
+    scale = data.get("grid_scale")
+    return OperationReport(
+        operation=str(data["operation"]),
+        accuracy_m=None if data["accuracy_m"] is None else float(data["accuracy_m"]),
+        grids=tuple(str(grid) for grid in data["grids"]),
+        heights=str(data["heights"]),
+        vertical=vertical,
+        unit_notes=tuple(str(note) for note in data["notes"]),
+        grid_scale=None if scale is None else (float(scale[0]), float(scale[1])),
     )
 
 
