@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -95,6 +95,29 @@ class LasCloud(Cloud):
                     raise ValueError(f"{left} of {self.count} points are missing")
                 left -= len(record)
                 yield record
+
+    def records_at(
+        self, places: Sequence[int], size: int, fields: Fields | None = None
+    ) -> Iterator[laspy.ScaleAwarePointRecord]:
+        """Yield up to `size` points from each of some places of the file, without reading what is between.
+
+        Args:
+            places: indices of the first point of each part, 0 to `count` - 1.
+            size: points a part, at most.
+            fields: as in `record_chunks`.
+
+        Raises:
+            InputError: if the file is truncated or damaged.
+
+        """
+        chosen = Fields.all() if fields is None else fields
+        with (
+            _reported(self.path),
+            laspy.open(self.path, read_evlrs=False, decompression_selection=chosen) as reader,
+        ):
+            for place in places:
+                reader.seek(place)
+                yield reader.read_points(min(size, self.count - place))
 
     def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
         """Yield (n, 3) float64 coordinates in the file's CRS and units, n <= size.
