@@ -17,7 +17,7 @@ from mtpcr_geo.core.frames import box_points
 from mtpcr_geo.crs import FrameLink, WorkFrame, resolve_frames
 from mtpcr_geo.io.las import check_distinct, open_cloud
 from mtpcr_geo.io.sample import Scan, scan
-from mtpcr_geo.method.bev import Density, choose_cell, density, grid_around
+from mtpcr_geo.method.bev import choose_cell, coverage_of, grid_around
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.progress import Progress
@@ -165,7 +165,7 @@ class _Check:
         except (CrsError, InputError):
             return  # reported where the common frame is settled
         try:
-            dense = density(sample, cloud.count)
+            dense = coverage_of(sample, points=cloud.count)
         except RegistrationError as error:
             inspection.too_large = error
             return
@@ -173,7 +173,7 @@ class _Check:
         outline = sample if inspection.scan.complete else link.to_work(box_points(inspection.bounds))
         low, high = outline.min(axis=0), outline.max(axis=0)
         inspection.measured = points.Measured(
-            sample, low, high, float(link.origin[2]), dense.per_m2, dense.area_m2
+            sample, low, high, float(link.origin[2]), dense.per_m2, dense.occupied_m2
         )
         found += points.density_findings(inspection.measured, cloud.count, role)
         found += points.plan_findings(inspection.measured, role)
@@ -257,7 +257,7 @@ class _Check:
         ]
         if self.refusals or not sides:
             return
-        cell = choose_cell(*(Density(measured.area_m2, measured.per_m2) for _, measured in sides))
+        cell = choose_cell(*(measured.per_m2 for _, measured in sides))
         for inspection, measured in sides:
             with self.stopping("raster-size", inspection.role):
                 grid_around(measured.low, measured.high, cell)
