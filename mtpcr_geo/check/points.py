@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mtpcr_geo.check.findings import Finding, Role, rewrite
-from mtpcr_geo.core.arrays import Floats, Mask
+from mtpcr_geo.core.arrays import ComparesArrays, Floats, Mask
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class Watched(Cloud):
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class Measured(ComparesArrays):
     """A cloud in metres of its own frame.
 
     Attributes:

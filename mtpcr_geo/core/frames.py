@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.arrays import ComparesArrays, Floats
 from mtpcr_geo.core.errors import CrsError
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ Vertical = Literal["refuse", "assume-same", "estimate"]
 
 
 @dataclass(frozen=True, eq=False)
-class WorkFrame:
+class WorkFrame(ComparesArrays):
     """The frame of all computation: a projected metric CRS, shifted to an integer origin.
 
     Attributes:
@@ -80,7 +80,7 @@ class OperationReport:
 
 
 @dataclass(frozen=True, eq=False)
-class FrameLink:
+class FrameLink(ComparesArrays):
     """The way between a file's coordinates and work coordinates of its side.
 
     File coordinates go through a PROJ pipeline where the CRSs differ, are multiplied by a factor where

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.arrays import ComparesArrays, Floats
 from mtpcr_geo.core.frames import FrameLink, box_points, fit_affine
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class TransformChain:
+class TransformChain(ComparesArrays):
     """A registration's result, ready to move points either way without losing digits far from the origin.
 
     Attributes:

@@ -60,7 +60,7 @@ _WGS84 = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Layer:
     """One vector layer.
 

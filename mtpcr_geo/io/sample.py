@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.arrays import ComparesArrays, Floats
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud
 from mtpcr_geo.core.errors import InputError
 
@@ -20,8 +20,8 @@ BUDGET = 4_000_000
 FEWEST_POINTS = 100
 
 
-@dataclass(frozen=True)
-class Scan:
+@dataclass(frozen=True, eq=False)
+class Scan(ComparesArrays):
     """What one pass over a cloud found.
 
     Attributes:

@@ -12,7 +12,7 @@ from mtpcr_geo.core.arrays import Floats
 TIMELINE = "stage"
 
 
-@dataclass
+@dataclass(eq=False)
 class Recorded:
     """What the layout needs to know about a recording.
 
