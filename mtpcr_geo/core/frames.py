@@ -1,4 +1,4 @@
-"""The metric work frame, and the exact way between it and the coordinates of a file."""
+"""The metric work frame, and the exact conversion between it and the coordinates of a file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class WorkFrame(ComparesArrays):
     Attributes:
         crs: the projected metric CRS, or None for a local frame in metres.
         origin: (3,) whole metres, subtracted from CRS coordinates.
-        output: the way from the target's work coordinates to a CRS asked for, where that is not the target's.
+        output: the link from the target's work coordinates to another CRS, where one was asked for.
 
     """
 
@@ -81,7 +81,7 @@ class OperationReport:
 
 @dataclass(frozen=True, eq=False)
 class FrameLink(ComparesArrays):
-    """The way between a file's coordinates and work coordinates of its side.
+    """The conversion between a file's coordinates and work coordinates of its side.
 
     File coordinates go through a PROJ pipeline where the CRSs differ, are multiplied by a factor where
     the units do, and are shifted by the origin.
@@ -177,7 +177,7 @@ def run_pipeline(pipeline: str, xyz: Floats, inverse: bool = False) -> Floats:
     """Take (n, 3) coordinates through a PROJ pipeline, or back.
 
     Raises:
-        CrsError: if PROJ does not know the pipeline, or it does not reach some point.
+        CrsError: if PROJ does not know the pipeline, or it is not defined at some point.
 
     """
     from pyproj.enums import TransformDirection
@@ -218,7 +218,7 @@ def fit_affine(move: Callable[[Floats], Floats], bounds: Floats, steps: int = 5)
     unit = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     moved = move(middle + unit * half)
     centre = moved.mean(axis=0)
-    # on a symmetric grid the columns are orthogonal: no solver is needed, and no digit is lost
+    # on a symmetric grid the columns are orthogonal: no solver is needed, and no precision is lost
     A = ((moved - centre).T @ unit) / (unit**2).sum(axis=0)
     worst = float(np.linalg.norm(moved - centre - unit @ A.T, axis=1).max())
     T = np.eye(4)

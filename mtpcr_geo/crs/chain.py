@@ -1,4 +1,4 @@
-"""The whole way of a point: source file, work frame, rigid transform, work frame, target file."""
+"""The whole conversion of a point: source file, work frame, rigid transform, work frame, target file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class TransformChain(ComparesArrays):
-    """A registration's result, ready to move points either way without losing digits far from the origin.
+    """A registration's result, ready to move points either way at full precision far from the origin.
 
     Attributes:
         source: between source file coordinates and source work coordinates.
@@ -36,7 +36,7 @@ class TransformChain(ComparesArrays):
 
     @classmethod
     def of(cls, pair: Pair) -> TransformChain:
-        """Take the chain of a solved pair.
+        """Return the chain of a solved pair.
 
         Raises:
             ValueError: if the pair has no transform yet.
@@ -87,7 +87,7 @@ class TransformChain(ComparesArrays):
 
     @property
     def is_affine(self) -> bool:
-        """Return whether one 4x4 on file coordinates says the same as the chain."""
+        """Return whether one 4x4 on file coordinates is exactly the chain."""
         return self.source.pipeline is None and self.target.pipeline is None
 
     @property

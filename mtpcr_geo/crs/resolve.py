@@ -1,4 +1,4 @@
-"""Settling in which frame two clouds are registered, and how each comes there and back."""
+"""The frame in which two clouds are registered, and how each is converted to it and back."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FARTHEST_APART = 100_000.0  # metres between the bounds of two clouds that both 
 
 
 def parse_crs(text: str) -> CRS | None:
-    """Read what a user says of a CRS: ``EPSG:25832``, WKT, a PROJ string, or ``local``.
+    """Return the CRS that a text names: ``EPSG:25832``, WKT, a PROJ string, or ``local``.
 
     Returns:
         The CRS, or None for ``local``.
@@ -42,7 +42,7 @@ def parse_crs(text: str) -> CRS | None:
         return CRS.from_user_input(text)
     except CRSError as error:
         raise CrsError(
-            f"{text!r} is not a coordinate reference system; say for example EPSG:25832, EPSG:7415 or local"
+            f"{text!r} is not a coordinate reference system; give for example EPSG:25832, EPSG:7415 or local"
         ) from error
 
 
@@ -56,7 +56,7 @@ def resolve_frames(
     vertical: Vertical = "refuse",
     out_crs: str | CRS | None = None,
 ) -> tuple[WorkFrame, FrameLink, FrameLink]:
-    """Settle in which frame two clouds are registered, and how each comes there.
+    """Return the frame in which two clouds are registered, and how each is converted to it.
 
     The work frame is the target's projection in metres, or for geographic and geocentric targets a
     transverse Mercator of true scale in their middle; its heights are the target's, in metres. The source
@@ -66,12 +66,12 @@ def resolve_frames(
     Args:
         target: the cloud that stays; its CRS is what its file or reader states.
         source: the cloud that moves, likewise.
-        target_crs: what the user says of the target instead: a CRS, its text, or "local".
-        source_crs: what the user says of the source instead.
-        local: both clouds are local, in metres, whatever the files say.
+        target_crs: the CRS to use for the target instead: a CRS, its text, or "local".
+        source_crs: the same for the source.
+        local: both clouds are local, in metres, whatever the files state.
         vertical: what to do where heights have different or unknown datums: "refuse"; "assume-same" takes
             them as equal; "estimate" takes them as they are and leaves the offset to the registration.
-        out_crs: CRS of the result where it shall not be the target's.
+        out_crs: CRS of the result where that is not the target's.
 
     Returns:
         The work frame (with the way out to `out_crs` as its `output`), the target's and the source's link.
@@ -102,12 +102,12 @@ def resolve_frames(
     return frame, target_link, source_link
 
 
-def _claimed(cloud: Cloud, said: str | CRS | None, role: str) -> CRS | None:
-    if isinstance(said, str):
-        return parse_crs(said)
-    crs = cloud.crs if said is None else said
+def _claimed(cloud: Cloud, declared: str | CRS | None, role: str) -> CRS | None:
+    if isinstance(declared, str):
+        return parse_crs(declared)
+    crs = cloud.crs if declared is None else declared
     if crs is None:
-        problem = getattr(cloud, "crs_problem", "") or "it says none"
+        problem = getattr(cloud, "crs_problem", "") or "it states none"
         raise CrsError(
             f"the {role} {cloud.name} has no coordinate reference system ({problem}); "
             f"give --{role}-crs EPSG:..., or --{role}-crs local (--local for both clouds) "
@@ -144,7 +144,7 @@ def _work_crs(facts: CrsFacts, bounds: Floats) -> CRS | None:
 def _link(
     facts: CrsFacts, work: CRS | None, heights: CrsFacts, bounds: Floats, vertical: Vertical
 ) -> FrameLink:
-    """Find the way from a cloud's CRS to the horizontal work CRS and the heights of another CRS."""
+    """Return the link from a cloud's CRS to the horizontal work CRS and the heights of another CRS."""
     factor = np.array([facts.unit, facts.unit, facts.height_unit])
     pipeline: str | None = None
     report = OperationReport()
@@ -201,7 +201,7 @@ def _heights_agree(facts: CrsFacts, other: CrsFacts, vertical: Vertical, notes: 
         raise CrsError(
             f"heights do not go together: {facts.height_name} in {facts.name}, "
             f"{other.height_name} in {other.name}; name a CRS with its vertical part (such as EPSG:7415), "
-            "or say --vertical assume-same or --vertical estimate"
+            "or give --vertical assume-same or --vertical estimate"
         )
     return False
 
@@ -263,15 +263,15 @@ def _require_near(target: FrameLink, source: FrameLink) -> None:
     if distance > FARTHEST_APART:
         raise CrsError(
             f"by their CRSs, source and target lie {distance / 1000:.0f} km apart; check that they show the "
-            "same place, or say --source-crs local if the source's coordinates are not in its CRS"
+            "same place, or give --source-crs local if the source's coordinates are not in its CRS"
         )
 
 
 def _output(
-    said: str | CRS, frame: WorkFrame, target: FrameLink, target_facts: CrsFacts, vertical: Vertical
+    declared: str | CRS, frame: WorkFrame, target: FrameLink, target_facts: CrsFacts, vertical: Vertical
 ) -> FrameLink:
-    """Find the way from the target's work coordinates to a CRS that the user wants."""
-    crs = parse_crs(said) if isinstance(said, str) else said
+    """Return the link from the target's work coordinates to a CRS that the user wants."""
+    crs = parse_crs(declared) if isinstance(declared, str) else declared
     if crs is None or frame.crs is None or target_facts.horizontal is None or target.bounds is None:
         raise CrsError(
             "--out-crs needs a target with a coordinate reference system, and one to go to; "

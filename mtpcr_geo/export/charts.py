@@ -15,7 +15,7 @@ _WIDTH = 640
 
 
 def bars(values: Sequence[float], labels: Sequence[str], notes: Sequence[str] = ()) -> str:
-    """Draw horizontal bars, the first one highlighted.
+    """Return horizontal bars, the first one highlighted.
 
     Args:
         values: lengths, none negative.
@@ -40,12 +40,12 @@ def bars(values: Sequence[float], labels: Sequence[str], notes: Sequence[str] = 
 
 
 def histogram(residual_m: Floats, inlier: Mask, limit_m: float, bins: int = 32) -> str:
-    """Draw how many tie points have which residual: agreeing ones green, the others red, stacked.
+    """Return a histogram of the residuals of tie points: agreeing ones green, the others red, stacked.
 
     Args:
-        residual_m: (n,) misfits in metres.
+        residual_m: (n,) residuals in metres.
         inlier: (n,) which agree with the transform.
-        limit_m: where the axis ends; larger misfits are counted in the last bar.
+        limit_m: where the axis ends; larger residuals are counted in the last bar.
 
     """
     height, base, left = 190, 160, 36
@@ -80,7 +80,7 @@ def histogram(residual_m: Floats, inlier: Mask, limit_m: float, bins: int = 32) 
 def residual_map(
     target: Floats, registered: Floats, colours: NDArray[np.uint8], rings: dict[str, Floats]
 ) -> str:
-    """Draw tie points in plan, coloured by residual, with the residual itself as a line, enlarged.
+    """Return tie points in plan, coloured by residual, with the residual itself as a line, enlarged.
 
     Args:
         target: (n, 3) target ends in metres.
@@ -124,7 +124,7 @@ def residual_map(
     y = height - 22
     parts.append(
         f'<path d="M10 {y:.0f}h{bar * scale:.1f}" stroke="currentColor" stroke-width="2"/>'
-        f'<text x="10" y="{y + 17:.0f}">{bar:g} m; misfits drawn {enlarge:g} times enlarged</text>'
+        f'<text x="10" y="{y + 17:.0f}">{bar:g} m; residuals drawn {enlarge:g} times their length</text>'
     )
     return _svg(_WIDTH, height, parts)
 

@@ -49,7 +49,7 @@ def write_bev(
         bev: the raster, in levelled work coordinates, metres.
         frame: CRS and origin of the work coordinates that the BEV's side has.
         T_level_work: 4x4 from work to levelled coordinates. Where it is not the identity the raster's
-            positions are not CRS coordinates, so the file gets no CRS and says in its tags how the
+            positions are not CRS coordinates, so the file gets no CRS; its tags state how the
             levelled frame lies.
         tags: further tags for the file.
 
@@ -220,7 +220,7 @@ def warp_bev(bev: Bev, T_to_bev: Floats, grid: Grid) -> Bev:
         row = np.repeat(rows, grid.width)
         column = np.tile(np.arange(grid.width), len(rows))
         plan = grid.to_metres(np.column_stack([column, row]).astype(np.float64))
-        found, xyz_bev, index = _look_back(bev, filled, T_to_bev, plan, height)
+        found, xyz_bev, index = _source_cells(bev, filled, T_to_bev, plan, height)
         row, column, xyz_bev, index = row[found], column[found], xyz_bev[found], index[found]
         top[row, column] = _move_z(T_to_bev, xyz_bev, bev.top.ravel()[index])
         low[row, column] = _move_z(T_to_bev, xyz_bev, bev.low.ravel()[index])
@@ -228,10 +228,10 @@ def warp_bev(bev: Bev, T_to_bev: Floats, grid: Grid) -> Bev:
     return Bev(grid, top, low, count)
 
 
-def _look_back(
+def _source_cells(
     bev: Bev, filled: Mask, T_to_bev: Floats, plan: Floats, height: float
 ) -> tuple[Mask, Floats, NDArray[np.int64]]:
-    """Find the BEV's cell for each of (n, 2) places: found or not, (n, 3) place in the BEV, flat index."""
+    """Return the BEV's cell for each of (n, 2) places: found or not, (n, 3) place in the BEV, flat index."""
     T_bev_to = transforms.inverse(T_to_bev)
     z_to = np.full(len(plan), (T_to_bev @ np.array([0.0, 0.0, height, 1.0]))[2])
     tilted = abs(T_to_bev[2, 2]) < 1.0 - 1e-7
@@ -264,7 +264,7 @@ def overview_levels(grid: Grid) -> int:
 
 
 def _move_z(T: Floats, xyz: Floats, z: Image) -> Floats:
-    """Heights after T of points with the plan position of `xyz` and height `z`."""
+    """Return heights after T of points with the plan position of `xyz` and height `z`."""
     return np.asarray(T[2, 0] * xyz[:, 0] + T[2, 1] * xyz[:, 1] + T[2, 2] * z + T[2, 3])
 
 

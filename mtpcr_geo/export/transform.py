@@ -1,4 +1,4 @@
-"""Transforms as files that say which frame they are in, at full precision."""
+"""Transforms as files that state their frames, at full precision."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def write_transform_json(path: str | Path, pair: Pair) -> None:
         "exactness": {
             "exact": chain.is_affine,
             "departure_m": chain.departure,
-            "note": "T_target_source says the same as the chain"
+            "note": "T_target_source is exactly the chain"
             if chain.is_affine
             else "T_target_source is the best fit within the source's bounds; the chain is exact",
         },
@@ -56,7 +56,7 @@ def write_transform_json(path: str | Path, pair: Pair) -> None:
             "source": chain.pivot,
             "target": chain.forward(chain.pivot[None])[0],
             "linear": T[:3, :3],
-            "note": "target = linear (x - source pivot) + target pivot loses no digits far from the origin",
+            "note": "target = linear (x - source pivot) + target pivot is precise far from the origin too",
         },
         "motion": _motion(chain),
         "work": {
@@ -171,7 +171,7 @@ def read_transform(path: str | Path) -> TransformChain:
 
 
 def frames_of(pair: Pair) -> dict[str, Any]:
-    """Say in which CRSs and units source, target and result stand, and how each comes to the work frame."""
+    """Return the CRSs and units of source, target and result, and how each comes to the work frame."""
     links = {"source": pair.source.link, "target": pair.target.link}
     links["result"] = pair.frame.output or pair.target.link
     frames: dict[str, Any] = {
@@ -188,7 +188,7 @@ def frames_of(pair: Pair) -> dict[str, Any]:
 
 
 def dumps(value: Any, indent: int = 0) -> str:
-    """Write JSON with 17 significant digits, and the rows of a matrix in a line each."""
+    """Return JSON with 17 significant digits, and the rows of a matrix in a line each."""
     pad = "  " * (indent + 1)
     if isinstance(value, np.ndarray):
         value = value.tolist()
@@ -242,7 +242,7 @@ def _motion(chain: TransformChain) -> dict[str, Any]:
 
 
 def units_of(link: FrameLink) -> list[str]:
-    """Name the units of x, y and z in a file."""
+    """Return the units of x, y and z in a file."""
     facts = facts_of(link.file_crs)
     return [facts.unit_name, facts.unit_name, facts.height_unit_name]
 
@@ -251,8 +251,8 @@ def _crs(crs: CRS | None, wkt: bool = True) -> dict[str, Any] | None:
     if crs is None:
         return None
     authority = crs.to_authority()
-    said = {"name": crs.name, "authority": ":".join(authority) if authority else None}
-    return said | {"wkt": crs.to_wkt("WKT2_2019")} if wkt else said
+    named = {"name": crs.name, "authority": ":".join(authority) if authority else None}
+    return named | {"wkt": crs.to_wkt("WKT2_2019")} if wkt else named
 
 
 def _link(link: FrameLink) -> dict[str, Any]:

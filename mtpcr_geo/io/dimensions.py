@@ -38,7 +38,7 @@ _PLACE = {"X", "Y", "Z"}
 
 
 def las_table(record: Any, xyz: Floats) -> PointTable:
-    """Lay out a laspy point record as columns by PDAL name, X, Y, Z (float64) first."""
+    """Return a laspy point record as columns by PDAL name, X, Y, Z (float64) first."""
     table: dict[str, NDArray[np.generic]] = {axis: xyz[:, i] for i, axis in enumerate("XYZ")}
     for dimension in record.point_format.dimensions:
         name = dimension.name
@@ -63,8 +63,8 @@ def separate_legacy_flags(table: PointTable) -> PointTable:
     """Take the flags out of the upper three bits of ``Classification``, where old programs keep them.
 
     PDAL before 2.6 gives the classification byte of LAS point formats 0-5 as it stands in the file: five
-    bits of class, then synthetic, key point and withheld. Only who reads such a file knows that; from the
-    values alone it cannot be known.
+    bits of class, then synthetic, key point and withheld. That depends on the
+    file read; it cannot be known from the values.
 
     Args:
         table: dimensions by PDAL name.

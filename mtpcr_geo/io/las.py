@@ -153,7 +153,7 @@ def open_cloud(path: str | Path, crs: CRS | None = None) -> LasCloud:
     """Open a LAS 1.0-1.4, LAZ or COPC file; nothing but its header is read.
 
     Args:
-        path: the file; its content says what it is, not its suffix.
+        path: the file; its content decides what it is, not its suffix.
         crs: coordinate reference system to take instead of what the file states.
 
     Raises:
@@ -179,7 +179,7 @@ def open_cloud(path: str | Path, crs: CRS | None = None) -> LasCloud:
 
 
 def _check_head(stream: BinaryIO) -> None:
-    """Check the counts at the head of the file before anything reads as much as they say.
+    """Check the counts at the head of the file before anything is read by them.
 
     Raises:
         ValueError: if the file cannot hold what they promise.
@@ -210,7 +210,7 @@ def _check_size(path: Path, header: laspy.LasHeader) -> None:
 
 
 def _check_chunk_table(stream: BinaryIO, header: laspy.LasHeader, records: list[Record]) -> None:
-    """Check what says where the compressed chunks lie: lazrs ends the whole process on absurd sizes.
+    """Check the table of the compressed chunks: lazrs ends the whole process on absurd sizes.
 
     Raises:
         ValueError: if the table contradicts the file.

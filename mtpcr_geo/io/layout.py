@@ -46,7 +46,7 @@ _WEEK = 604_800.0
 
 
 def layout(cloud: Cloud, crs: CRS | None) -> tuple[laspy.LasHeader, Iterator[Chunk]]:
-    """Decide how a cloud is written, and stream its points in that layout.
+    """Return how a cloud is written, and its points in that layout.
 
     Args:
         cloud: any cloud; a `LasCloud` keeps its dimensions, extra bytes, identifiers and records.
@@ -75,7 +75,7 @@ def layout(cloud: Cloud, crs: CRS | None) -> tuple[laspy.LasHeader, Iterator[Chu
 
 
 def wkt_of(crs: CRS) -> str:
-    """Write a CRS as the WKT 1 that LAS 1.4 prescribes, or as WKT 2 where only that can express it."""
+    """Return a CRS as the WKT 1 that LAS 1.4 prescribes, or as WKT 2 where only that can express it."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
@@ -121,7 +121,7 @@ def _vlr(record: Record) -> laspy.VLR:
 
 
 def modern(record: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Turn a laspy record of any point format into packed records of its modern format, X, Y, Z left out.
+    """Return a laspy record of any point format as packed records of its modern format, X, Y, Z left out.
 
     Class 12 of the old formats means overlap: the class stays and the flag of that name is set.
     """

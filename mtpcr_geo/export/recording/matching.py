@@ -1,4 +1,4 @@
-"""What keypoint matching leaves in a recording: images, keypoints, the sweep, FOCUS before and after."""
+"""What a recording shows of keypoint matching: images, keypoints, the sweep, FOCUS before and after."""
 
 from __future__ import annotations
 
