@@ -30,7 +30,7 @@ _LABELS = {
     "held_out_tolerance_m": "agreeing within",
     "held_out_median_m": "median residual of held-out tie points, plan",
     "neg_log10_p": "significance of that (-log10 p)",
-    "hypothesis_margin": "strength over the next distinct pose, times",
+    "hypothesis_margin": "times stronger than the next distinct pose",
     "patch_support": "patches that agree on the pose",
     "overlap_m2": "ground that both see",
     "overlap_source": "overlap, share of the source",

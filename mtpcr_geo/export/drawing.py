@@ -347,7 +347,7 @@ def _masked_blur(top: Image, filled: Mask, sigma: float, fill: bool = False) -> 
 
 
 def _masked_mean(top: Image, filled: Mask, size: int) -> Image:
-    """Return the mean of filled cells in a square of `size` cells; the overall median where there are none."""
+    """Return the mean of filled cells in a square of `size` cells; the overall median where it has none."""
     import cv2
 
     middle = np.float32(np.median(top[filled])) if filled.any() else np.float32(0.0)

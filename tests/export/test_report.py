@@ -222,7 +222,8 @@ def test_metrics_have_labels_and_units():
         )
     )
     assert rows == {
-        "ground that both see": "4,728 m²", "standard deviation of yaw": "0.02°", "inlier share": "50.0 %", "unknown": "not known",
+        "ground that both see": "4,728 m²", "standard deviation of yaw": "0.02°",
+        "inlier share": "50.0 %", "unknown": "not known",
         "n": "3", "shift": "1.000, 2.000, 3.000 m", "good": "yes", "folds: plan": "0.123 m",
     }  # fmt: skip
 
