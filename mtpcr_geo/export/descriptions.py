@@ -82,7 +82,9 @@ def side_rows(side: Side) -> list[Row]:
         ("origin of the work frame", ", ".join(f"{value:.0f}" for value in side.link.origin) + " m"),
     ]
     tilt = math.degrees(transforms.rotation_angle(side.T_level_work[:3, :3]))
-    rows.append(("levelling", f"rotated by {tilt:.2f}°" if tilt > 0 else "not needed"))
+    rows.append(
+        ("levelling", f"rotated by {tilt:.2f}°" if tilt > 0 else f"none: {side.levelling.why or 'upright'}")
+    )
     if side.bev is not None:
         grid = side.bev.grid
         share = float(np.count_nonzero(side.bev.count)) / max(side.bev.count.size, 1)
@@ -100,7 +102,7 @@ def transform_rows(pair: Pair) -> list[Row]:
     rows = [("yaw", f"{math.degrees(yaw):+.4f}° (counter-clockwise from above)"), ("tilt", f"{tilt:.4f}°")]
     moved = shift_text(pair)
     if moved:
-        rows.append(("the middle moves by", moved))
+        rows.append(("shift of the source's middle", moved))
     rows.append(("result in", result_text(pair)))
     offset = TransformChain.of(pair).vertical_offset_m
     if offset is not None:
