@@ -82,9 +82,8 @@ def side_rows(side: Side) -> list[Row]:
         ("origin of the work frame", ", ".join(f"{value:.0f}" for value in side.link.origin) + " m"),
     ]
     tilt = math.degrees(transforms.rotation_angle(side.T_level_work[:3, :3]))
-    rows.append(
-        ("levelling", f"rotated by {tilt:.2f}°" if tilt > 0 else f"none: {side.levelling.why or 'upright'}")
-    )
+    kept = f"none: {side.levelling.why or 'upright'}"
+    rows.append(("levelling", f"rotated by {tilt:.2f}°" if tilt > 0 else kept))
     if side.bev is not None:
         grid = side.bev.grid
         share = float(np.count_nonzero(side.bev.count)) / max(side.bev.count.size, 1)
