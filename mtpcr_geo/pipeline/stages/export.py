@@ -41,7 +41,7 @@ class Apply(Stage):
         if pair.T_target_source is None:
             raise OptionError(f"{self.label} needs a solved pair; put mtpcr.solve before it")
         if refused(pair) and not (self.options.force or context.force):
-            self.metadata["held_out"] = "the verdict is refused"
+            self.metadata["skipped"] = "the verdict is refused"
             return None
         return Moved(pair)
 
