@@ -19,14 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from mtpcr_geo.benchmark.published import COMBINATIONS, Combination
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.errors import InputError, MissingPartError
 
-Floats = NDArray[np.float64]
 POINTS_TOPIC = "/velodyne/points"
 TRUTH_TOPIC = "/gnss/ground_truth"
 LARGEST_GAP_S = 0.25
@@ -55,7 +54,7 @@ class Trajectory:
         places = np.stack([np.interp(time, self.time, self.position[:, k]) for k in range(3)], axis=1)
         return Slerp(self.time, self.rotation)(time), places
 
-    def covers(self, time: Floats) -> NDArray[np.bool_]:
+    def covers(self, time: Floats) -> Mask:
         """Say which of (k,) times lie between two poses that are not too far apart to interpolate."""
         after = np.searchsorted(self.time, time, side="left")
         known = (time >= self.time[0]) & (time <= self.time[-1])

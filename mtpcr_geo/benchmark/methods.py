@@ -13,14 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mtpcr_geo.benchmark.simulator.raycast import import_open3d
+from mtpcr_geo.benchmark.baselines.open3d import import_open3d
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import MissingPartError, OptionError
 from mtpcr_geo.core.suggestions import meant
 
-Floats = NDArray[np.float64]
 Judgement = Literal["accepted", "doubtful", "refused", "unjudged"]
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.methods import Estimate
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.progress import NoProgress
@@ -20,7 +20,6 @@ from mtpcr_geo.pipeline.registry import make_options, stage_types
 from mtpcr_geo.pipeline.stage import RunContext, Stage, Value
 from mtpcr_geo.registration import build_pipeline, read_options
 
-Floats = NDArray[np.float64]
 _FIRST, _LAST = "mtpcr.level", "mtpcr.assess"
 
 

@@ -10,12 +10,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from mtpcr_geo.benchmark.tables import grouped
+from mtpcr_geo.core.arrays import Floats
 
-Floats = NDArray[np.float64]
 STEP_M = 1.0
 BAND_M = 12.0
 QUANTILES = (5, 50, 95)

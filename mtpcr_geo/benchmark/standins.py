@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.published import COMBINATIONS, TABLE_I, Combination, Scene
 from mtpcr_geo.benchmark.simulator import instruments, scanners
@@ -34,11 +33,11 @@ from mtpcr_geo.benchmark.simulator.raycast import Caster
 from mtpcr_geo.benchmark.simulator.scanners import Block
 from mtpcr_geo.benchmark.simulator.site import MARGIN_M, Site, make_site
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.io.outputs import OutputSet
 
-Floats = NDArray[np.float64]
 PREFIX = "standin_"
 # mostly a campus, as the dataset's site was; other kinds now and then, so that nothing fits one only
 KINDS: tuple[Kind, ...] = (

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.memory import peak_mib, reset_peak
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.progress import NoProgress
@@ -21,8 +21,6 @@ from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.pipeline.registry import make_options, stage_types
 from mtpcr_geo.pipeline.stage import RunContext, Stage, Value
 from mtpcr_geo.registration import build_pipeline, read_options
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

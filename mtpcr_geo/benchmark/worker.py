@@ -10,16 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark import memory
 from mtpcr_geo.benchmark.methods import Estimate, Method, load_libraries, make_method
 from mtpcr_geo.benchmark.metrics import overlap_ratios, pose_errors
 from mtpcr_geo.benchmark.pairs import BenchmarkPair, load_pair
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import MtpcrError, RegistrationError
 
-Floats = NDArray[np.float64]
 SAMPLE = 20_000
 
 

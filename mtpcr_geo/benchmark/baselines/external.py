@@ -39,16 +39,15 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mtpcr_geo.benchmark import memory
 from mtpcr_geo.benchmark.methods import Estimate
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.pipeline.registry import first_problem
 
-Floats = NDArray[np.float64]
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _SAMPLE_S = 0.05
 # runs the command with a limit on its address space; a limit in the parent would bind the parent

@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.methods import Estimate
-from mtpcr_geo.benchmark.simulator.raycast import import_open3d
+from mtpcr_geo.benchmark.baselines.open3d import import_open3d
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats, Indices
 
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
 _FEWEST_MATCHES = 3
 _ROWS, _COLUMNS = 512, 2048
 
@@ -57,7 +56,7 @@ def features(xyz: Floats, voxel: float, *, normals: float = 2.0, reach: float = 
     return Features(cloud, fpfh)
 
 
-def mutual_matches(source: Features, target: Features) -> NDArray[np.int64]:
+def mutual_matches(source: Features, target: Features) -> Indices:
     """Return (n, 2) numbers of source and target points that are each other's nearest in feature space."""
     # all against all: trees gain nothing in 33 dimensions, and Open3D's took three times as long
     a, b = (np.asarray(one.fpfh.data, np.float32).T for one in (source, target))
@@ -88,7 +87,7 @@ def _nearest_both_ways(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[
     return there, back
 
 
-def at_most(matches: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:
+def at_most(matches: Indices, most: int, seed: int) -> Indices:
     """Draw at most so many of the matches, in their order."""
     if len(matches) <= most:
         return matches

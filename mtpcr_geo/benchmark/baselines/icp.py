@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.methods import Estimate
-
-Floats = NDArray[np.float64]
+from mtpcr_geo.core.arrays import Floats
 
 
 class PointToPointIcp:

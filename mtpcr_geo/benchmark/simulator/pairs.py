@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.simulator import instruments, scanners
 from mtpcr_geo.benchmark.simulator.kinds import KINDS, STYLES, Kind
@@ -25,13 +24,13 @@ from mtpcr_geo.benchmark.simulator.raycast import Caster
 from mtpcr_geo.benchmark.simulator.scanners import Block
 from mtpcr_geo.benchmark.simulator.site import MARGIN_M, Site, make_site
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats, Indices
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.io.outputs import OutputSet
 
 __all__ = ["KINDS", "Kind", "SimulatedPair", "describe", "simulate_pair", "write_laz", "write_pair"]
 
-Floats = NDArray[np.float64]
 Ground = Literal["robot", "tripod"]
 Air = Literal["airborne", "uav"]
 TARGET_EPSG = 25832
@@ -230,7 +229,7 @@ def shared_block(
     return best[1:]
 
 
-def thinned(xyz: Floats, voxel: float) -> NDArray[np.int64]:
+def thinned(xyz: Floats, voxel: float) -> Indices:
     """Return the numbers of the first points of each voxel, in their old order."""
     if voxel <= 0:
         return np.arange(len(xyz))

@@ -11,11 +11,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.simulator.instruments import Beams
-
-Floats = NDArray[np.float64]
+from mtpcr_geo.core.arrays import Floats, Mask
 
 
 class HeightAt(Protocol):
@@ -148,7 +146,7 @@ class Block:
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         return np.asarray(xy @ np.array([[c, s], [-s, c]]))
 
-    def contains(self, xy: Floats) -> NDArray[np.bool_]:
+    def contains(self, xy: Floats) -> Mask:
         """Say which (n, 2) site places lie in the block."""
         uv = self.to_block(xy)
         return np.asarray(((uv >= self.low) & (uv < self.high)).all(axis=1))
