@@ -25,6 +25,7 @@ from mtpcr_geo.benchmark.published import COMBINATIONS, Combination
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.errors import InputError, MissingPartError
+from mtpcr_geo.core.voxels import first_in_voxels
 
 POINTS_TOPIC = "/velodyne/points"
 TRUTH_TOPIC = "/gnss/ground_truth"
@@ -266,8 +267,5 @@ def _open(bag: Path) -> Iterator[Any]:
 
 
 def _thinned(xyz: Floats, voxel: float) -> Floats:
-    cell = np.floor(xyz / voxel).astype(np.int64)
-    cell -= cell.min(axis=0)
-    size = cell.max(axis=0) + 1
-    _, first = np.unique((cell[:, 2] * size[1] + cell[:, 1]) * size[0] + cell[:, 0], return_index=True)
-    return np.asarray(xyz[np.sort(first)])
+    # a lattice from the origin, so that thinning twice leaves what thinning once does
+    return np.asarray(xyz[first_in_voxels(xyz, voxel, np.zeros(3))])

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from mtpcr_geo.benchmark.pairs import write_folder
 from mtpcr_geo.benchmark.published import COMBINATIONS, TABLE_I, Combination, Scene
 from mtpcr_geo.benchmark.simulator import instruments, scanners
 from mtpcr_geo.benchmark.simulator.instruments import Scan
@@ -25,9 +26,7 @@ from mtpcr_geo.benchmark.simulator.pairs import (
     SimulatedPair,
     describe,
     shared_block,
-    thinned,
     walk_through,
-    write_laz,
 )
 from mtpcr_geo.benchmark.simulator.raycast import Caster
 from mtpcr_geo.benchmark.simulator.scanners import Block
@@ -36,7 +35,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.io.outputs import OutputSet
+from mtpcr_geo.core.voxels import first_in_voxels
 
 PREFIX = "standin_"
 # mostly a campus, as the dataset's site was; other kinds now and then, so that nothing fits one only
@@ -117,11 +116,7 @@ def write_stand_in(folder: Path, stand_in: StandIn, *, density: float = 1.0) -> 
             "figures": "the paper's Table I" if stand_in.given else "means of the group's rows in Table I",
         }
     }
-    with OutputSet(overwrite=True) as out:
-        for name, cloud in (("source.laz", pair.source), ("target.laz", pair.target)):
-            write_laz(out.path(place / name), cloud)
-        out.path(place / "pair.json").write_text(json.dumps(facts, indent=1) + "\n", "utf-8")
-        out.commit()
+    write_folder(place, pair.source, pair.target, facts, overwrite=True)
     return place
 
 
@@ -224,7 +219,7 @@ def _drive(site: Site, path: Floats, epoch: int, density: float, rng: np.random.
     beams = scanners.robot_beams(path, site.ground.height, int(2_000_000 * density), rng)
     scan = instruments.measure(Caster(site.mesh(epoch)), beams, instruments.ROBOT, rng)
     scan = scan.part(np.abs(scan.xyz[:, :2]).max(axis=1) < site.half + MARGIN_M - 2.0)
-    return scan.part(thinned(scan.xyz, 0.12))
+    return scan.part(first_in_voxels(scan.xyz, 0.12))
 
 
 def _fly(site: Site, block: Block, epoch: int, density: float, rng: np.random.Generator) -> Scan:

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from mtpcr_geo.benchmark.memory import peak_mib, reset_peak
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.progress import NoProgress
+from mtpcr_geo.core.system import peak_memory_mb, reset_peak_memory
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.pipeline.registry import make_options, stage_types
@@ -70,7 +70,7 @@ def follow(pair: Pair, steps: Iterable[Mapping[str, Any]]) -> Outcome:
         MtpcrError: if an option is wrong or a part is missing.
 
     """
-    reset_peak()
+    reset_peak_memory()
     seconds: dict[str, float] = {}
     failure = None
     with OutputSet() as outputs, closing(RunContext(outputs, NoProgress())) as context:
@@ -88,7 +88,7 @@ def follow(pair: Pair, steps: Iterable[Mapping[str, Any]]) -> Outcome:
                 seconds[stage.type] = time.perf_counter() - began
             assert isinstance(made, Pair)
             pair = made
-    return Outcome(pair, failure, seconds, peak_mib())
+    return Outcome(pair, failure, seconds, peak_memory_mb())
 
 
 def random_start(

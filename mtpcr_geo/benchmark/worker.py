@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from mtpcr_geo.benchmark import memory
 from mtpcr_geo.benchmark.methods import Estimate, Method, load_libraries, make_method
 from mtpcr_geo.benchmark.metrics import overlap_ratios, pose_errors
 from mtpcr_geo.benchmark.pairs import BenchmarkPair, load_pair
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import MtpcrError, RegistrationError
+from mtpcr_geo.core.system import peak_memory_mb, reset_peak_memory
 
 SAMPLE = 20_000
 
@@ -119,7 +119,7 @@ def run_once(pair: BenchmarkPair, method: Method, T_start: Floats, seed: int) ->
     """
     source = transforms.apply(T_start, pair.source)
     T_true = transforms.inverse(T_start)
-    memory.reset_peak()
+    reset_peak_memory()
     began = time.perf_counter()
     try:
         answer = method.estimate(source, pair.target.copy(), seed=seed)
@@ -132,7 +132,7 @@ def run_once(pair: BenchmarkPair, method: Method, T_start: Floats, seed: int) ->
         "verdict": answer.verdict,
         "reason": answer.reason,
         "time_s": seconds,
-        "memory_mib": memory.peak_mib() if answer.memory_mib is None else answer.memory_mib,
+        "memory_mib": peak_memory_mb() if answer.memory_mib is None else answer.memory_mib,
         "details": answer.details,
     }
     T = answer.T_target_source

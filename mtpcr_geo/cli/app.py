@@ -326,15 +326,14 @@ def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the demo's files.")] = Path(
         "mtpcr-demo"
     ),
-    seed: Annotated[int, typer.Option(help="Seed of the simulated town.")] = 0,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Simulate a town, scan it from a street and from the air, register the two, compare with the truth."""
+    """Register a simulated town, scanned from a street and from the air, and compare with the truth."""
     from mtpcr_geo.cli.demo import run_demo
 
     with progress_bars(quiet) as progress:
-        result = run_demo(out, seed=seed, overwrite=overwrite, progress=progress)
+        result = run_demo(out, overwrite=overwrite, progress=progress)
     _report(result.registration, as_json=False, verbose=False, quiet=quiet)
     if not quiet:
         typer.echo(result.summary)

@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 
 from mtpcr_geo.benchmark import methods, pairs, published, standins, tables
 from mtpcr_geo.benchmark.baselines import external, fpfh
+from mtpcr_geo.benchmark.baselines.open3d import import_open3d
+from mtpcr_geo.benchmark.pairs import write_laz
 from mtpcr_geo.benchmark.plots import binned, cumulative
 from mtpcr_geo.benchmark.protocol import RUNS, read_rows, run_protocol
 from mtpcr_geo.benchmark.runs import Wanted, run_benchmark
-from mtpcr_geo.benchmark.simulator.pairs import write_laz
-from mtpcr_geo.benchmark.baselines.open3d import import_open3d
 from mtpcr_geo.benchmark.worker import StartRange
 from mtpcr_geo.cli.app import app
 from mtpcr_geo.core import transforms

@@ -41,7 +41,6 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from mtpcr_geo.benchmark import memory
 from mtpcr_geo.benchmark.methods import Estimate
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
@@ -197,7 +196,7 @@ def write_points(path: Path, xyz: Floats, description: Description) -> None:
     else:
         from pyproj import CRS
 
-        from mtpcr_geo.benchmark.simulator.pairs import write_laz
+        from mtpcr_geo.benchmark.pairs import write_laz
         from mtpcr_geo.core.cloud import ArrayCloud
 
         crs = None if description.crs is None else CRS.from_epsg(description.crs)
@@ -220,7 +219,7 @@ def _waited(process: subprocess.Popen[bytes], limit: float) -> tuple[int, float 
             return process.wait(_SAMPLE_S), peak, False
         except subprocess.TimeoutExpired:
             # what the system adds up at the end would count this process too, as it was at the fork
-            now = memory.tree_mib(process.pid)
+            now = tree_memory_mib(process.pid)
             peak = now if peak is None else max(peak, now or 0.0)
         if time.monotonic() > end:
             if os.name == "posix":
@@ -229,6 +228,21 @@ def _waited(process: subprocess.Popen[bytes], limit: float) -> tuple[int, float 
             else:
                 process.kill()
             return process.wait(), peak, True
+
+
+def tree_memory_mib(pid: int) -> float | None:
+    """Return the resident memory of a process and all that descend from it, now, in MiB.
+
+    None where the system does not tell (it is read from ``/proc``).
+    """
+    folder = Path("/proc") / str(pid)
+    try:
+        status = (folder / "status").read_text()
+        children = (folder / "task" / str(pid) / "children").read_text().split()
+    except OSError:
+        return None
+    own = next((int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS:")), 0)
+    return own / 1024 + sum(tree_memory_mib(int(child)) or 0.0 for child in children)
 
 
 def _end_of(reported: Path) -> str:
