@@ -11,7 +11,6 @@ import typer
 from typer.core import TyperGroup
 
 import mtpcr_geo
-from mtpcr_geo.benchmark.command import benchmark
 from mtpcr_geo.cli.shared import AsJson, Overwrite, Quiet, Verbose, progress_bars
 from mtpcr_geo.core.errors import EXIT_DOUBTFUL, EXIT_REFUSED, MtpcrError, OptionError
 
@@ -340,7 +339,28 @@ def demo(
     raise typer.Exit(EXIT_BY_VERDICT[result.registration.verdict.name])
 
 
-app.command()(benchmark)
+_PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+
+
+@app.command(context_settings=_PASSED_ON)
+def benchmark(context: typer.Context) -> None:
+    """Run methods on pairs with a known transform, from random starts; write tables and plots."""
+    _benchmark_room("benchmark", context.args)
+
+
+@app.command(context_settings=_PASSED_ON)
+def simulate(context: typer.Context) -> None:
+    """Simulate pairs of ground and aerial clouds with a known transform (extra: benchmark)."""
+    _benchmark_room("simulate", context.args)
+
+
+def _benchmark_room(name: str, arguments: list[str]) -> None:
+    """Run a verb whose module is loaded only when it is called."""
+    from importlib import import_module
+
+    alone = typer.Typer(add_completion=False, rich_markup_mode=None)
+    alone.command(name)(getattr(import_module("mtpcr_geo.benchmark.command"), name))
+    typer.main.get_command(alone)(arguments, prog_name=f"mtpcr-geo {name}", standalone_mode=False)
 
 
 def main() -> None:

@@ -30,7 +30,7 @@ from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.voxels import first_in_voxels
 
-__all__ = ["KINDS", "Kind", "SimulatedPair", "describe", "simulate_pair", "write_pair"]
+__all__ = ["KINDS", "Kind", "SimulatedPair", "describe", "simulate_from", "simulate_pair", "write_pair"]
 
 TARGET_EPSG = 25832
 # parts of the ground scan (of its time) tried in turn until the shares come out as asked
@@ -88,10 +88,10 @@ def simulate_pair(kind: Kind, seed: int = 0, **options: Any) -> SimulatedPair:
         MissingPartError: if ``embreex`` is not installed.
 
     """
-    return simulate(pair_options(kind=kind, seed=seed, **options))
+    return simulate_from(pair_options(kind=kind, seed=seed, **options))
 
 
-def simulate(options: PairOptions) -> SimulatedPair:
+def simulate_from(options: PairOptions) -> SimulatedPair:
     """Make the pair of a set of options; see `simulate_pair`."""
     kind, seed, leafiness = options.kind, options.seed, options.leafiness
     site = make_site(kind, seed, options.extent_m)
