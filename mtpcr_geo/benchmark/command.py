@@ -51,10 +51,10 @@ def benchmark(
 
     An interrupted benchmark goes on where it stopped when the same command is given again.
     """
-    from mtpcr_geo.benchmark.runs import Wanted, numbers_of, run_benchmark, shown
+    from mtpcr_geo.benchmark.runs import PairSelection, numbers_of, run_benchmark, shown
     from mtpcr_geo.benchmark.worker import StartRange
 
-    wanted = Wanted(
+    selection = PairSelection(
         tuple(data or ()),
         simulated,
         standins,
@@ -65,7 +65,7 @@ def benchmark(
     )
     with progress_bars(quiet) as progress:
         rows = run_benchmark(
-            wanted,
+            selection,
             [word for text in methods for word in text.split()],
             out,
             pairs=pairs,
@@ -114,7 +114,7 @@ def _with_options_of_pairs() -> Any:
     def simulate(**given: Any) -> None:
         _simulate(**given)
 
-    wanted: dict[str, tuple[Any, Any]] = {
+    declared: dict[str, tuple[Any, Any]] = {
         "out": (
             Annotated[Path, typer.Argument(help="Folder for the pairs' folders.", show_default=False)],
             inspect.Parameter.empty,
@@ -124,17 +124,17 @@ def _with_options_of_pairs() -> Any:
         description = field.description or name
         shown = typer.Option(help=f"{description[:1].upper()}{description[1:]}.")
         kind = tuple[float, float] if name == "leafiness" else field.annotation
-        wanted[name] = (Annotated[kind, shown], field.default)
-    wanted["count"] = (Annotated[int, typer.Option(help="Number of pairs; each has the next seed.")], 1)
-    wanted["overwrite"] = (Overwrite, False)
-    wanted["quiet"] = (Quiet, False)
+        declared[name] = (Annotated[kind, shown], field.default)
+    declared["count"] = (Annotated[int, typer.Option(help="Number of pairs; each has the next seed.")], 1)
+    declared["overwrite"] = (Overwrite, False)
+    declared["quiet"] = (Quiet, False)
     parameters = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
-        for name, (kind, default) in wanted.items()
+        for name, (kind, default) in declared.items()
     ]
     # typer takes a function's parameters from its signature
     simulate.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    simulate.__annotations__ = {name: kind for name, (kind, _) in wanted.items()}
+    simulate.__annotations__ = {name: kind for name, (kind, _) in declared.items()}
     simulate.__doc__ = _simulate.__doc__
     return simulate
 

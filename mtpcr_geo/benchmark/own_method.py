@@ -1,4 +1,4 @@
-"""Our own method as the benchmark runs it: the stages that `register` builds, on clouds in memory."""
+"""The registration as the benchmark runs it: the stages that `register` builds, on clouds in memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mtpcr_geo.registration import build_pipeline, read_options
 _FIRST, _LAST = "mtpcr.level", "mtpcr.assess"
 
 
-class Ours:
+class RegistrationMethod:
     """The registration from levelling to verdict, without reading and writing files.
 
     Args:
@@ -36,7 +36,7 @@ class Ours:
         self._stages(0)
 
     def estimate(self, source: Floats, target: Floats, *, seed: int) -> Estimate:
-        """Register the source to the target; a refused answer is handed on as such."""
+        """Register the source to the target; a refusal is returned as one."""
         value: list[Value] = [ArrayCloud(target, None, "target"), ArrayCloud(source, None, "source")]
         with OutputSet() as outputs:
             context = RunContext(outputs, NoProgress())
@@ -68,7 +68,7 @@ class Ours:
         known = stage_types()
         stages = []
         for spec in chain:
-            words = {key: value for key, value in spec.items() if key not in ("type", "tag", "inputs")}
+            given = {key: value for key, value in spec.items() if key not in ("type", "tag", "inputs")}
             kind = known[spec["type"]]
-            stages.append(kind(make_options(spec["type"], kind.Options, words), str(spec.get("tag", ""))))
+            stages.append(kind(make_options(spec["type"], kind.Options, given), str(spec.get("tag", ""))))
         return stages

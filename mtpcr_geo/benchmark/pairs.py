@@ -28,7 +28,7 @@ class BenchmarkPair:
 
     Attributes:
         name: the folder's.
-        group: which group of the tables it belongs to, such as "A-G"; "pairs" where none is said.
+        group: which group of the tables it belongs to, such as "A-G"; "pairs" where it names none.
         source: (n, 3) where it truly lies, noise and held out points left out.
         target: (m, 3), likewise.
         origin: (3,) the frame's origin in the target's file coordinates, whole metres.
@@ -108,10 +108,10 @@ def load_pair(folder: Path) -> BenchmarkPair:
     low, high = transforms.bounds(target)
     origin = np.floor((low + high) / 2)
     T_local_source = transforms.translation(-origin) @ true_transform(facts)
-    said = facts.get("benchmark", {})
+    labels = facts.get("benchmark", {})
     return BenchmarkPair(
         name=folder.name,
-        group=str(said.get("group", "pairs")),
+        group=str(labels.get("group", "pairs")),
         source=transforms.apply(T_local_source, source),
         target=target - origin,
         origin=origin,
@@ -157,15 +157,15 @@ def write_laz(path: Path, cloud: ArrayCloud) -> None:
         header.add_crs(cloud.crs)
     las = laspy.LasData(header)
     las.xyz = cloud.xyz
-    for ours, theirs in (
+    for name, field in (
         ("Intensity", "intensity"),
         ("ReturnNumber", "return_number"),
         ("NumberOfReturns", "number_of_returns"),
         ("Classification", "classification"),
         ("GpsTime", "gps_time"),
     ):
-        if ours in cloud.extra:
-            las[theirs] = cloud.extra[ours]
+        if name in cloud.extra:
+            las[field] = cloud.extra[name]
     las.write(str(path))
 
 

@@ -95,17 +95,17 @@ def compare(
 
     ``simulated_median`` is "within" the real clouds' range, or "below" or "above" it.
     """
-    ours, theirs = spread(simulated), spread(real)
+    of_simulated, of_real = spread(simulated), spread(real)
     lines = []
-    for name, (low, median, high) in theirs.items():
-        middle = ours[name][1]
+    for name, (low, median, high) in of_real.items():
+        middle = of_simulated[name][1]
         lies = "below" if middle < low else "above" if middle > high else "within"
         lines.append(
             {
                 "figure": name,
-                "simulated_min": ours[name][0],
+                "simulated_min": of_simulated[name][0],
                 "simulated_mid": middle,
-                "simulated_max": ours[name][2],
+                "simulated_max": of_simulated[name][2],
                 "real_min": low,
                 "real_mid": median,
                 "real_max": high,
@@ -116,7 +116,7 @@ def compare(
 
 
 def margins(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Gather the hypothesis margins of our runs by pair: lowest, median and highest.
+    """Gather the hypothesis margins of the registration's runs by pair: lowest, median and highest.
 
     The margin is how many times stronger the best pose is than the next distinct one: the verdict's metric
     ``hypothesis_margin``.

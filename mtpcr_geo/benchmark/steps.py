@@ -31,7 +31,7 @@ class Outcome:
         pair: as far as it came.
         failure: why it came no further, or None.
         seconds: time of each step, by type.
-        memory_mib: most resident memory meanwhile, everything included; None where the system does not say.
+        memory_mib: most resident memory meanwhile, everything included; None where it is unknown.
 
     """
 
@@ -104,7 +104,7 @@ def random_start(
     Args:
         rng: of the draw.
         centre: (3,) about which is turned, metres.
-        yaw_deg, shift_m, tilt_deg: the most of each.
+        yaw_deg, shift_m, tilt_deg: the largest of each.
 
     """
     direction = rng.normal(size=3)
@@ -115,7 +115,7 @@ def random_start(
     return transforms.translation(shift) @ transforms.about(centre, R)
 
 
-def _stage(words: Mapping[str, Any]) -> Stage:
-    kind = stage_types()[words["type"]]
-    own = {key: value for key, value in words.items() if key not in ("type", "tag", "inputs")}
-    return kind(make_options(str(words["type"]), kind.Options, own), str(words["tag"]))
+def _stage(step: Mapping[str, Any]) -> Stage:
+    kind = stage_types()[step["type"]]
+    own = {key: value for key, value in step.items() if key not in ("type", "tag", "inputs")}
+    return kind(make_options(str(step["type"]), kind.Options, own), str(step["tag"]))

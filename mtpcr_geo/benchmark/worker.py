@@ -24,7 +24,7 @@ SAMPLE = 20_000
 
 @dataclass(frozen=True)
 class StartRange:
-    """How a source is thrown off before each run.
+    """The random transforms that displace a source before its runs.
 
     Attributes:
         yaw_deg: turned about the vertical by 0 to this, degrees, about the source's centroid.
@@ -40,7 +40,7 @@ class StartRange:
     seed: int = 0
 
     def draw(self, pair: str, start: int, centroid: Floats) -> tuple[Floats, dict[str, float]]:
-        """Draw one start: the 4x4 that throws the source off, and how it is made up."""
+        """Draw one start: the 4x4 that displaces the source, and its parts."""
         rng = np.random.default_rng([self.seed, start, *pair.encode()])
         yaw, tilt, shift = (rng.uniform(0.0, 1.0, 3) * (self.yaw_deg, self.tilt_deg, self.shift_m)).tolist()
         azimuth = rng.uniform(0.0, 2 * np.pi)

@@ -17,7 +17,7 @@ A JSON file describes it::
   "laz" (LAS 1.4, millimetres). Metres, z up, near the origin. ``crs`` (an EPSG code) is written into a LAZ.
 - ``voxel`` thins the clouds to a point per voxel of this edge, metres, before they are written.
 - The command writes the 4x4 that takes source to target as text to ``{result}``: the last sixteen numbers
-  of the file count, row by row. Lines of words before them do no harm. A scale in it is taken out, and
+  of the file count, row by row. Lines of text before them are skipped. A scale in it is taken out, and
   noted with the run.
 - An exit code other than 0, no result within the time limit, or more memory than allowed: a run without an
   answer, with the end of what the command printed as the reason. The memory limit is on the address space
@@ -57,7 +57,7 @@ _LIMITER = (
 
 
 class Description(BaseModel):
-    """What the JSON file says."""
+    """The content of the JSON file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -109,7 +109,7 @@ class External:
         return replace(answer, T_target_source=T, details={"scale": scale})
 
     def _run(self, folder: Path, words: dict[str, str]) -> Estimate:
-        reported = folder / "told.txt"
+        reported = folder / "output.txt"
         command = [_filled(word, words) for word in self.description.command]
         limit = self.description.memory_limit_mib
         if limit is not None and os.name == "posix":
@@ -247,5 +247,5 @@ def tree_memory_mib(pid: int) -> float | None:
 
 def _end_of(reported: Path) -> str:
     lines = reported.read_text(encoding="utf-8", errors="replace").split("\n")
-    said = [line.strip() for line in lines if line.strip()]
-    return said[-1][:300] if said else "it said nothing"
+    printed = [line.strip() for line in lines if line.strip()]
+    return printed[-1][:300] if printed else "it printed nothing"

@@ -26,7 +26,7 @@ class Instrument:
         noise_m: standard deviation of a range.
         divergence_rad: standard deviation of a beam's direction.
         drop_out: share of returns lost for no reason.
-        returns: most returns of one pulse.
+        returns: largest number of returns of one pulse.
         closest_m: nearest range measured.
 
     """
@@ -139,7 +139,7 @@ def _returned(
 
 
 def _window(xyz: Floats, normal: Floats, material: NDArray[np.uint8], draw: Floats) -> Mask:
-    """Say which hits on facades fall on a pane and are lost."""
+    """Return which hits on facades fall on a pane and are lost."""
     along = normal[:, 0] * xyz[:, 1] - normal[:, 1] * xyz[:, 0]
     pane = (np.mod(along / 2.6, 1.0) < 0.42) & (np.abs(np.mod(xyz[:, 2] / 2.9, 1.0) - 0.5) < 0.24)
     return np.asarray((material == Material.FACADE) & pane & (draw < 0.7))

@@ -59,7 +59,7 @@ class SimulatedPair:
         overlap_source: share of the source's occupied 1 m cells (true pose, seen from above) that lie
             within one cell of an occupied cell of the target.
         overlap_target: the same the other way round.
-        description: in words.
+        description: of the site and the scanners.
         options: what it was made with.
 
     """
@@ -226,7 +226,7 @@ def write_pair(folder: Path, pair: SimulatedPair, *, overwrite: bool = False) ->
 
 
 def describe(pair: SimulatedPair, names: tuple[str, str] = ("source.laz", "target.laz")) -> dict[str, Any]:
-    """Return what ``pair.json`` says: CRS, truth, overlap, the two clouds by file name, how it was made."""
+    """Return the content of ``pair.json``: CRS, truth, overlap, both clouds by file name, options."""
     crs = pair.target.crs
     return {
         "id": pair.name,
