@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import inspect
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
+from pydantic import Field
 
-from mtpcr_geo.benchmark.simulator.options import PairOptions, pair_options
-from mtpcr_geo.cli.shared import Overwrite, Quiet, progress_bars
-from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.benchmark.simulator.options import PairOptions
+from mtpcr_geo.cli.options import Quiet as QuietOption
+from mtpcr_geo.cli.parameters import command_of
+from mtpcr_geo.cli.shared import Quiet, progress_bars
+from mtpcr_geo.pipeline.options import RUN, Overwrite, Shown
 
 
 def benchmark(
@@ -79,64 +81,45 @@ def benchmark(
         typer.echo(shown(rows) + f"\nTables and plots: {out}")
 
 
-def _simulate(
-    out: Path, *, count: int = 1, overwrite: bool = False, quiet: bool = False, **options: Any
-) -> None:
-    """Simulate pairs of a ground and an aerial cloud, and write each into a folder of its own in OUT.
+class SimulateVerb(PairOptions):
+    """Options of ``simulate``."""
 
-    A folder such as town_0 holds source.laz (ground), target.laz (aerial) and pair.json with the known
-    transform: what `mtpcr-geo benchmark --data OUT` runs on. Needs the extra `benchmark`.
+    out: Annotated[
+        Path,
+        Field(description="folder in which each pair gets a folder of its own"),
+        Shown(RUN, argument=True),
+    ]
+    count: Annotated[int, Field(ge=1, description="number of pairs; each has the next seed"), Shown(RUN)] = 1
+    overwrite: Overwrite = False
+    quiet: QuietOption = False
+
+
+def _simulate(given: SimulateVerb) -> None:
+    """Simulate pairs of a ground and an aerial cloud with a known transform (extra: benchmark).
+
+    A pair's folder, such as town_0, holds source.laz (ground), target.laz (aerial) and pair.json with the
+    transform: what `mtpcr-geo benchmark --data` runs on. Needs the extra benchmark.
+
+    Examples:
+        mtpcr-geo simulate pairs
+        mtpcr-geo simulate pairs --kind forest --seed 3 --count 2 --overlap 0.1
+
     """
     from mtpcr_geo.benchmark.simulator.pairs import simulate_from, write_pair
 
-    if count < 1:
-        raise OptionError(f"--count is {count}; there must be at least one pair")
-    first = pair_options(**options)
-    with progress_bars(quiet) as progress, progress.task("simulating pairs", count) as advance:
-        for seed in range(first.seed, first.seed + count):
+    first = PairOptions(**{name: getattr(given, name) for name in PairOptions.model_fields})
+    with progress_bars(given.quiet) as progress, progress.task("simulating pairs", given.count) as advance:
+        for seed in range(first.seed, first.seed + given.count):
             pair = simulate_from(first.model_copy(update={"seed": seed}))
-            write_pair(out / pair.name, pair, overwrite=overwrite)
-            if not quiet:
+            folder = given.out / pair.name
+            write_pair(folder, pair, overwrite=given.overwrite)
+            if not given.quiet:
                 typer.echo(
-                    f"{out / pair.name}: {pair.source.count:,} ground and {pair.target.count:,} aerial "
-                    f"points; {pair.overlap_source:.0%} of the ground cloud's cells and "
-                    f"{pair.overlap_target:.0%} of the aerial one's are shared"
+                    f"{folder}: {pair.source.count:,} ground and {pair.target.count:,} aerial points; "
+                    f"{pair.overlap_source:.0%} of the ground cloud's cells and {pair.overlap_target:.0%} of "
+                    "the aerial one's are shared"
                 )
             advance(1)
 
 
-def _with_options_of_pairs() -> Any:
-    """Return `_simulate` with one parameter for each field of `PairOptions`, for typer to read.
-
-    The fields' limits are judged by the model alone.
-    """
-
-    def simulate(**given: Any) -> None:
-        _simulate(**given)
-
-    declared: dict[str, tuple[Any, Any]] = {
-        "out": (
-            Annotated[Path, typer.Argument(help="Folder for the pairs' folders.", show_default=False)],
-            inspect.Parameter.empty,
-        )
-    }
-    for name, field in PairOptions.model_fields.items():
-        description = field.description or name
-        shown = typer.Option(help=f"{description[:1].upper()}{description[1:]}.")
-        kind = tuple[float, float] if name == "leafiness" else field.annotation
-        declared[name] = (Annotated[kind, shown], field.default)
-    declared["count"] = (Annotated[int, typer.Option(help="Number of pairs; each has the next seed.")], 1)
-    declared["overwrite"] = (Overwrite, False)
-    declared["quiet"] = (Quiet, False)
-    parameters = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
-        for name, (kind, default) in declared.items()
-    ]
-    # typer takes a function's parameters from its signature
-    simulate.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    simulate.__annotations__ = {name: kind for name, (kind, _) in declared.items()}
-    simulate.__doc__ = _simulate.__doc__
-    return simulate
-
-
-simulate = _with_options_of_pairs()
+simulate = command_of(SimulateVerb, _simulate)

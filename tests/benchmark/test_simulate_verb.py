@@ -30,6 +30,11 @@ def test_pairs_are_written_and_are_what_the_benchmark_reads(tmp_path):
     assert facts["simulation"]["kind"] == "campus"
     again = run(tmp_path, "--kind", "campus", "--seed", 4, *SMALL)
     assert again.exit_code == 7
+    winter = run(tmp_path / "winter", "--kind", "campus", "--seed", 4, "--ground-leaves", 0.25, *SMALL)
+    assert winter.exit_code == 0
+    bare = json.loads((tmp_path / "winter" / "campus_4" / "pair.json").read_text())
+    assert bare["simulation"]["ground_leaves"] == 0.25
+    assert bare["source"]["points"] != facts["source"]["points"]
     assert "exists already" in again.stderr
 
 
@@ -38,6 +43,7 @@ def test_every_option_of_a_pair_is_an_option_of_the_verb():
     for name, field in PairOptions.model_fields.items():
         assert f"--{name.replace('_', '-')}" in text, name
         assert field.description, name
+    assert "  simulate " in CliRunner().invoke(app, ["--help"]).output
 
 
 @pytest.mark.parametrize(

@@ -93,12 +93,12 @@ def simulate_pair(kind: Kind, seed: int = 0, **options: Any) -> SimulatedPair:
 
 def simulate_from(options: PairOptions) -> SimulatedPair:
     """Make the pair of a set of options; see `simulate_pair`."""
-    kind, seed, leafiness = options.kind, options.seed, options.leafiness
+    kind, seed = options.kind, options.seed
     site = make_site(kind, seed, options.extent_m)
     chance = np.random.default_rng([seed, 23])
     yaw = float(chance.uniform(-0.2, 0.2))
     path = walk_through(site, yaw)
-    caster = Caster(site.mesh(0, leafiness[0]))
+    caster = Caster(site.mesh(0, options.ground_leaves))
     if options.ground == "robot":
         beams = scanners.robot_beams(
             path, site.ground.height, options.ground_beams, chance, drift_m=options.drift_m
@@ -117,8 +117,8 @@ def simulate_from(options: PairOptions) -> SimulatedPair:
         )
 
     low, block, path = shared_block(low, path, site, yaw, (options.overlap, options.overlap))
-    if options.epochs_apart or leafiness[1] != leafiness[0]:
-        caster = Caster(site.mesh(options.epochs_apart, leafiness[1]))
+    if options.epochs_apart or options.air_leaves != options.ground_leaves:
+        caster = Caster(site.mesh(options.epochs_apart, options.air_leaves))
     fly = scanners.airborne_beams if options.air == "airborne" else scanners.uav_beams
     how = instruments.AIRBORNE if options.air == "airborne" else instruments.UAV
     high = instruments.measure(
