@@ -11,6 +11,7 @@ from mtpcr_geo.core import transforms
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from mtpcr_geo.pipeline.records import StageRecord
     from mtpcr_geo.pipeline.runner import RunResult
     from mtpcr_geo.registration import Registration
 
@@ -95,7 +96,7 @@ def _metric_rows(metrics: Mapping[str, Any], verbose: bool) -> list[tuple[str, s
     return metric_rows(metrics if verbose or not chosen else chosen)
 
 
-def _print_stages(console: Console, done: Sequence[Mapping[str, Any]]) -> None:
-    for entry in done:
-        note = entry.get("skipped") or entry.get("failed") or ""
-        console.print(f"  {entry['seconds']:8.2f} s  {entry['tag']} ({entry['type']}) {note}", soft_wrap=True)
+def _print_stages(console: Console, done: Sequence[StageRecord]) -> None:
+    for record in done:
+        note = record.skipped or record.failed or ""
+        console.print(f"  {record.seconds:8.2f} s  {record.tag} ({record.type}) {note}", soft_wrap=True)
