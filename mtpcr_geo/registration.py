@@ -151,7 +151,8 @@ class Registration:
             raise MissingPartError(f"plot() needs matplotlib ({error}): pip install matplotlib") from error
         if self.pair is None or self.pair.source.bev is None or self.pair.target.bev is None:
             raise RegistrationError(f"there is nothing to plot: {'; '.join(self.verdict.reasons)}")
-        return registration_figure(self.pair, self.verdict.name)
+        names = " to ".join(Path(side.cloud.name).name for side in (self.pair.source, self.pair.target))
+        return registration_figure(self.pair, f"{names}: {self.verdict.name}")
 
     def save(
         self,

@@ -51,7 +51,7 @@ def registration_figure(pair: Pair, title: str = "") -> RegistrationFigure:
         raise ValueError("a figure needs both height rasters")
     figure = RegistrationFigure(figsize=(_WIDTH_INCHES, _HEIGHT_INCHES), dpi=_DPI, layout="constrained")
     left, right = figure.subplots(1, 2)
-    figure.suptitle(title)
+    figure.suptitle(title, fontweight="bold")
     if pair.T_target_source is None:
         for axes, bev, role in ((left, source, "source"), (right, target, "target")):
             _show(axes, drawing.shaded_relief(_thin(bev).top, _thin(bev).grid.cell), _thin(bev).grid)
@@ -59,7 +59,7 @@ def registration_figure(pair: Pair, title: str = "") -> RegistrationFigure:
         return figure
     T = pair.target.T_level_work @ pair.T_target_source @ transforms.inverse(pair.source.T_level_work)
     _draw_over(left, source, target, T)
-    left.set_title("registered source over target")
+    left.set_title("registered source, coloured by height, over the target in grey")
     pictured = drawing.common_rasters(pair, max_side=_MOST_CELLS)
     _show(right, drawing.edge_overlay(*pictured), pictured[0].grid)
     right.set_title("height steps in the overlap")
