@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
 import tempfile
+import weakref
 from collections.abc import Sequence
 from functools import cached_property
 from html import escape
@@ -56,7 +58,7 @@ class Registration:
         result: RunResult,
         *,
         force: bool = False,
-        recording: tempfile.TemporaryDirectory[str] | None = None,
+        recording: Path | None = None,
     ) -> None:
         self.verdict = result.verdict or Verdict("refused", ("the pipeline judged nothing",), {})
         self.pair: Pair | None = result.pair
@@ -64,8 +66,9 @@ class Registration:
         self.force = force
         self._result = result
         self._recording = recording
-        written = () if recording is not None else result.outputs
-        self.outputs = _by_name(written)
+        self.outputs = _by_name(result.outputs if recording is None else ())
+        if recording is not None:
+            weakref.finalize(self, shutil.rmtree, recording.parent, ignore_errors=True)
 
     @cached_property
     def T_target_source(self) -> Floats | None:
@@ -182,10 +185,7 @@ class Registration:
             InputError: if an input file has changed since.
 
         """
-        recording = None
-        if self._recording is not None:
-            recording = Path(self._recording.name) / OUTPUT_NAMES["recording"]
-        stages = writers_of(Path(folder), force=force or self.force, recording=recording)
+        stages = writers_of(Path(folder), force=force or self.force, recording=self._recording)
         last = [tag for tag, value in self._result.values.items() if value is self.pair and value is not None]
         nodes = chained(stages, tuple(last[-1:]))
         self.outputs = _by_name(
@@ -272,9 +272,15 @@ def register(
         return Registration(run(nodes, overwrite=chosen.overwrite, progress=progress), force=chosen.force)
     if not chosen.recording:
         return Registration(run(nodes, progress=progress), force=chosen.force)
-    folder = tempfile.TemporaryDirectory(prefix="mtpcr-geo-")
-    nodes += chained([recording_writer(Path(folder.name))], (nodes[-1].tag,))
-    return Registration(run(nodes, progress=progress), force=chosen.force, recording=folder)
+    # kept aside until it is saved, and gone with what is returned
+    folder = Path(tempfile.mkdtemp(prefix="mtpcr-geo-"))
+    nodes += chained([recording_writer(folder)], (nodes[-1].tag,))
+    try:
+        result = run(nodes, progress=progress)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return Registration(result, force=chosen.force, recording=folder / OUTPUT_NAMES["recording"])
 
 
 def apply(
