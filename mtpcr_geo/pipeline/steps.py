@@ -137,7 +137,12 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
         else BevOptions(cell=options.cell or 1.0, pixel="ceil")
     )
     match = MatchOptions(method=options.matcher or "superpoint", models=options.models, seed=seed)
-    refine = RefineOptions(method="point_to_point", ground=False, reach=[3.0, 1.5, 0.75], keep_tie_points=0)
+    refine = RefineOptions(
+        method="point_to_point",
+        ground=False,
+        max_correspondence_distance=[3.0, 1.5, 0.75],
+        keep_tie_points=0,
+    )
     steps: list[Stage] = [
         MakeBev(bev, f"{prefix}bev"),
         Enhance(EnhanceOptions(look="paper" if options.enhance else "grey"), f"{prefix}enhance"),
