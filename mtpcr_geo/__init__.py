@@ -5,8 +5,10 @@
 >>> registration.verdict.name  # doctest: +SKIP
 'accepted'
 
-Clouds are files, (n, 3) arrays, `laspy.LasData` or `Cloud`. What is offered here is imported when it is
-asked for, so that importing the package costs next to nothing.
+Clouds are files, (n, 3) arrays, `laspy.LasData` or `Cloud`. The steps of the method stand alone too, as
+functions on arrays: `level`, `make_bev`, `mtpcr_geo.match.correlation.match`, `tie_points_of`,
+`solve_tie_points`, `refine`. What is offered here is imported when it is asked for, so that importing the
+package costs next to nothing.
 """
 
 from importlib import import_module
@@ -18,6 +20,11 @@ if TYPE_CHECKING:
     from mtpcr_geo.core.errors import MtpcrError
     from mtpcr_geo.core.types import Verdict
     from mtpcr_geo.io.memory import read
+    from mtpcr_geo.method.bev import make_bev
+    from mtpcr_geo.method.inverse_mapping import tie_points_of
+    from mtpcr_geo.method.levelling import level
+    from mtpcr_geo.method.refine import refine
+    from mtpcr_geo.method.solve import solve_tie_points
     from mtpcr_geo.pipeline.api import Pipeline
     from mtpcr_geo.registration import Registration, apply, register
 
@@ -31,8 +38,13 @@ __all__ = [
     "__version__",
     "apply",
     "check",
+    "level",
+    "make_bev",
     "read",
+    "refine",
     "register",
+    "solve_tie_points",
+    "tie_points_of",
 ]
 
 _MODULE_OF = {
@@ -42,8 +54,13 @@ _MODULE_OF = {
     "Registration": "mtpcr_geo.registration",
     "Verdict": "mtpcr_geo.core.types",
     "apply": "mtpcr_geo.registration",
+    "level": "mtpcr_geo.method.levelling",
+    "make_bev": "mtpcr_geo.method.bev",
     "read": "mtpcr_geo.io.memory",
+    "refine": "mtpcr_geo.method.refine",
     "register": "mtpcr_geo.registration",
+    "solve_tie_points": "mtpcr_geo.method.solve",
+    "tie_points_of": "mtpcr_geo.method.inverse_mapping",
 }
 
 

@@ -208,7 +208,7 @@ class Registration:
         return f"<div><b>Registration: {escape(self.verdict.name)}</b><table>{rows}</table></div>"
 
     def _rows(self) -> list[tuple[str, str]]:
-        """Say in a few words what moves, how, and why the verdict is what it is."""
+        """Return what moves, how, and the reasons of the verdict, as (name, text)."""
         rows = []
         if self.pair is not None:
             names = (Path(side.cloud.name).name for side in (self.pair.source, self.pair.target))

@@ -316,6 +316,22 @@ def test_names_at_the_top_are_there_and_lazy():
         mg.registre  # noqa: B018
 
 
+def test_steps_of_the_method_alone(of_arrays, xyz):
+    from mtpcr_geo.match.correlation import CorrelationSettings, match
+
+    origins = [np.floor(points.mean(axis=0)) for points in xyz]
+    source, target = (points - origin for points, origin in zip(xyz, origins, strict=True))
+    for points in (source, target):
+        assert mg.level(points, "auto", georeferenced=False).T_level_work.shape == (4, 4)
+    bevs = [mg.make_bev(points, cell=1.0) for points in (source, target)]
+    ties = mg.tie_points_of(match(*bevs, CorrelationSettings()), *bevs)
+    solution, inlier = mg.solve_tie_points(ties, tolerance=1.5)
+    assert inlier.sum() > 30
+    T = mg.refine(source, target, solution.T).T
+    there = source @ T[:3, :3].T + T[:3, 3] + origins[1]
+    assert np.linalg.norm(there - of_arrays.apply(xyz[0]), axis=1).mean() < 0.3
+
+
 def test_check_and_read_at_the_top(town_files):
     report = mg.check(*town_files)
     assert report.goes_on

@@ -47,7 +47,7 @@ class Pipeline:
         progress: where long work reports.
 
     Raises:
-        OptionError: if `spec` is no pipeline; it says what was given.
+        OptionError: if `spec` is no pipeline; the message names what was given.
         InputError: if a path cannot be read, or an array is no cloud.
 
     Example:
@@ -262,7 +262,7 @@ def _text_of(spec: Spec) -> str | bytes:
     """Return a pipeline as JSON text.
 
     Raises:
-        OptionError: if it is none; it says what was given.
+        OptionError: if it is none; the message names what was given.
         InputError: if it is a path that cannot be read.
 
     """

@@ -1,4 +1,4 @@
-"""Which stages there are, and how one is made from its words in the JSON."""
+"""Which stages there are, and how one is made from its options in the JSON."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ def execute(
 
     Raises:
         MtpcrError: whatever stopped it; a registration that fails is no such stop where the pipeline
-            keeps evidence: then the result says so.
+            keeps evidence: then the result has the reason.
 
     """
     nodes = _planned(specs, settings, given)
@@ -196,7 +196,7 @@ def _facts(nodes: Sequence[Node], before: RunResult | None) -> RunFacts:
 
 
 def _inputs_behind_late(nodes: Sequence[Node]) -> dict[str, tuple[str, ...]]:
-    """Let what takes from a late stage take from before it: a late stage hands on what it was given."""
+    """Return each stage's inputs, where a late stage is replaced by its own: it returns what it took."""
     late = {node.tag for node in nodes if node.stage.late}
     inputs: dict[str, tuple[str, ...]] = {}
     for node in nodes:
@@ -236,7 +236,7 @@ def _check(nodes: Sequence[Node], context: RunContext) -> None:
 
 
 def _preview(nodes: Sequence[Node], context: RunContext) -> None:
-    """Let every stage look at the inputs that headers tell of."""
+    """Let every stage check the inputs that are known from headers."""
     values: dict[str, Value] = {}
     for node in nodes:
         inputs = [values[tag] for tag in node.inputs if tag in values]
@@ -249,7 +249,7 @@ def _preview(nodes: Sequence[Node], context: RunContext) -> None:
 
 
 def _turn(stage: Stage, inputs: Sequence[Value | None], context: RunContext) -> Value | None:
-    """Run one stage, or say why it is skipped, and note it."""
+    """Run one stage, or skip it, and put it on record."""
     start = time.perf_counter()
     skipped = failed = None
     value: Value | None = None

@@ -32,7 +32,7 @@ OptionsModel = type[StageOptions]
 
 
 class Progress(Protocol):
-    """Where long work says how far it is."""
+    """Where long work reports how far it is."""
 
     def task(self, what: str, total: int | None = None) -> AbstractContextManager[Any]:
         """Open a task; the context gives a callable `advance(n)`."""
@@ -110,7 +110,7 @@ class Stage(ABC):
         Options: the pydantic model of its options.
         evidence: whether it still runs, with what there is, when the registration failed or was refused;
             its inputs may then hold None.
-        late: whether it runs after all others, since it tells about the whole run.
+        late: whether it runs after all others, since it reports on the whole run.
 
     """
 
@@ -165,7 +165,10 @@ class Stage(ABC):
 
     @abstractmethod
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
-        """Do the work. Writers hand on what they were given; None means nothing goes on from here."""
+        """Do the work, and return what the next stages take; None where nothing goes on from here.
+
+        Writers return what they took.
+        """
 
     def one_pair(self, inputs: Sequence[Value]) -> Pair:
         """Take the single registration state among the inputs.
@@ -219,7 +222,7 @@ def chained(stages: Sequence[Stage], first_inputs: tuple[str, ...] = ()) -> list
     nodes: list[Node] = []
     for stage in stages:
         inputs = (nodes[-1].tag,) if nodes else first_inputs
-        # what is left at its default says nothing
+        # options at their default are left out, as in pipelines written by hand
         nodes.append(Node(stage, inputs, stage.options.model_dump(mode="json", exclude_defaults=True)))
     return nodes
 

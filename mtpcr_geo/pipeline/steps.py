@@ -161,7 +161,7 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
 
 
 def reader_of(cloud: CloudLike, tag: str) -> Stage:
-    """Make the stage that reads a file, or hands on a cloud in memory."""
+    """Make the stage that reads a file, or returns a cloud in memory."""
     if not isinstance(cloud, str | os.PathLike):
         return MemoryReader(cloud_of(cloud, tag), tag)
     path = Path(cloud)

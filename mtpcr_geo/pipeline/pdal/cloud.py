@@ -104,7 +104,7 @@ class PdalCloud(Cloud):
         if is_writer(step.spec) and step.written:
             return inputs
         if step.tag not in chain:
-            chain[step.tag] = stage_json(step.spec, inputs, **_passing_names(step, context))
+            chain[step.tag] = stage_json(step.spec, inputs, **_temporary_filename(step, context))
         return [step.tag]
 
     def _stream_first(self, pipeline: Any) -> Any:
@@ -191,8 +191,8 @@ def _steps_before(last: Step) -> list[Step]:
     return list(seen.values())
 
 
-def _passing_names(step: Step, context: RunContext) -> dict[str, Any]:
-    """Replace what a writer writes by a passing name, under which nothing looks finished."""
+def _temporary_filename(step: Step, context: RunContext) -> dict[str, Any]:
+    """Return the temporary filename of a writer, under which nothing looks finished."""
     template, file = numbered_files(step.spec), file_written(step.spec)
     if template is not None:
         return {"filename": str(context.outputs.template(template))}

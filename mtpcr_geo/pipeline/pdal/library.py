@@ -114,7 +114,7 @@ def arrays_of(iterator: Any) -> Iterator[NDArray[np.void]]:
 
 
 def problem_of(stages: Sequence[Mapping[str, Any]]) -> str | None:
-    """Let PDAL prepare stages without running them, and give what it says against them, if anything.
+    """Let PDAL prepare stages without running them, and return its first complaint, or None.
 
     Preparing reads the options and the headers of inputs; no point is read and no file is written.
     """

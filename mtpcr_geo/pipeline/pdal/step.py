@@ -1,4 +1,4 @@
-"""One stage of PDAL as it is handed to PDAL: its JSON, its files, and what PDAL says of it."""
+"""One stage of PDAL as it is handed to PDAL: its JSON, its files, and PDAL's messages about it."""
 
 from __future__ import annotations
 
@@ -75,12 +75,12 @@ def stage_json(spec: StageSpec, inputs: Sequence[str], **changed: Any) -> dict[s
 
 
 def failure(spec: StageSpec, message: str, *, preparing: bool = False) -> MtpcrError:
-    """Put what PDAL says in one line that names the stage.
+    """Return the error for a message of PDAL, in one line that names the stage.
 
     Args:
         spec: the stage that PDAL blames.
-        message: PDAL's.
-        preparing: whether PDAL said so before it ran.
+        message: the one of PDAL.
+        preparing: whether it came before the run.
 
     """
     detail = _PASSING.sub(r"\1\2", message.removeprefix(f"{spec.type}: "))

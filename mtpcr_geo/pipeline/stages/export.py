@@ -22,11 +22,11 @@ TransformFormat = Literal["json", "cloudcompare", "pdal"]
 class ApplyOptions(StageOptions):
     """Options of mtpcr.apply."""
 
-    force: bool = Field(False, description="hand on the moved cloud though the verdict refuses it")
+    force: bool = Field(False, description="return the moved cloud though the verdict is refused")
 
 
 class Apply(Stage):
-    """Move the source to the target: hands on the moved cloud, or nothing when the verdict is refused."""
+    """Move the source to the target; nothing comes out when the verdict is refused."""
 
     type = "mtpcr.apply"
     Options = ApplyOptions
@@ -80,7 +80,7 @@ class EvidenceWriter(Stage):
         return None
 
     def write(self, pair: Pair, context: RunContext) -> None:
-        """Write the file under its passing name."""
+        """Write the file under its temporary name."""
         raise NotImplementedError
 
 
@@ -269,7 +269,7 @@ def run_facts(pair: Pair | None, context: RunContext) -> dict[str, Any]:
         "verdict": verdict.name if verdict else None,
         "reasons": list(verdict.reasons) if verdict else [],
         "metrics": verdict.metrics if verdict else {},
-        # found, which says nothing of whether to use it: that is the verdict
+        # whether to use it is the verdict's to say
         "T_target_source": TransformChain.of(pair).T_file
         if pair is not None and pair.T_target_source is not None
         else None,

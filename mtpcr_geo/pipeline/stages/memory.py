@@ -13,7 +13,7 @@ from mtpcr_geo.pipeline.stages.export import EvidenceWriter, FileOptions, WriteR
 
 
 class MemoryReader(Stage):
-    """Hand on a cloud given from Python."""
+    """Return a cloud given from Python."""
 
     type: ClassVar[str] = "readers.memory"
     Options = StageOptions
