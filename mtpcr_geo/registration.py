@@ -138,7 +138,7 @@ class Registration:
         return self._chain
 
     def plot(self) -> Figure:
-        """Draw the registered source over the target, and the height steps of both.
+        """Draw the registered source over the target, and the difference of their lowest heights.
 
         Returns:
             A matplotlib figure; notebooks show it, ``savefig`` writes it.

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import replace
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
-from mtpcr_geo.core import transforms
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Floats, Pair
 from mtpcr_geo.export import drawing
 from mtpcr_geo.export.geotiff import grid_around, warp_bev
+from mtpcr_geo.method.bev import coarsen
 
-_MOST_CELLS = 800  # of a side of a panel
+_MOST_CELLS = 500  # of a side of the left panel
+_DETAIL_CELLS = 300  # of a side of the right panel
+_LARGEST_DIFFERENCE_M = 2.0
+_FILLED_SHARE = 0.95
+_BLOCK_CELLS = 8
 _SOURCE_OPACITY = 0.75
 _WIDTH_INCHES, _HEIGHT_INCHES = 11.0, 5.4
 _DPI = 110
@@ -34,8 +38,9 @@ class RegistrationFigure(Figure):
 def registration_figure(pair: Pair, title: str = "") -> RegistrationFigure:
     """Draw both height rasters, the source where the transform puts it.
 
-    Left the registered source over the target, seen from above; right the height steps of both where they
-    overlap: where the registration holds, the source's run along the target's. Without a transform both
+    Left the registered source over the target, seen from above; right the difference of their lowest heights
+    in the middle of the overlap: pale where both see the same ground, and in pairs of red and blue along
+    every edge where they are shifted. Cells are joined until nearly all are filled. Without a transform both
     rasters stand beside each other. Axes are metres in the target's work frame.
 
     Args:
@@ -52,39 +57,42 @@ def registration_figure(pair: Pair, title: str = "") -> RegistrationFigure:
     figure = RegistrationFigure(figsize=(_WIDTH_INCHES, _HEIGHT_INCHES), dpi=_DPI, layout="constrained")
     left, right = figure.subplots(1, 2)
     figure.suptitle(title, fontweight="bold")
+    source, target = _readable(source), _readable(target)
     if pair.T_target_source is None:
         for axes, bev, role in ((left, source, "source"), (right, target, "target")):
-            _show(axes, drawing.shaded_relief(_thin(bev).top, _thin(bev).grid.cell), _thin(bev).grid)
+            _show(axes, drawing.shaded_relief(bev.top, bev.grid.cell), bev.grid)
             axes.set(title=f"{role} (not registered)", xlabel="x (m)", ylabel="y (m)")
         return figure
-    T = pair.target.T_level_work @ pair.T_target_source @ transforms.inverse(pair.source.T_level_work)
-    _draw_over(left, source, target, T)
-    left.set_title("registered source, coloured by height, over the target in grey")
-    pictured = drawing.common_rasters(pair, max_side=_MOST_CELLS)
-    _show(right, drawing.edge_overlay(*pictured), pictured[0].grid)
-    right.set_title("height steps in the overlap")
-    labels = [
-        Patch(color=np.array(colour) / 255, label=label)
-        for colour, label in ((drawing.SOURCE_RGB, "source"), (drawing.TARGET_RGB, "target"))
-    ]
-    right.legend(handles=labels, loc="upper right", framealpha=0.85)
+    shown = pair.with_(source=replace(pair.source, bev=source), target=replace(pair.target, bev=target))
+    _draw_over(left, source, target, pair.levelled(pair.T_target_source))
+    left.set_title("registered source (coloured) over target (grey)", fontsize="medium")
+    _draw_difference(figure, right, *_middle(*drawing.common_rasters(shown)))
+    right.set_title("lowest heights, source minus target", fontsize="medium")
     for axes in (left, right):
         _label(axes, pair)
     return figure
 
 
+def _draw_difference(figure: Figure, axes: Axes, source: Bev, target: Bev) -> None:
+    """Draw by how much the source lies above the target: red above, blue below, pale where they agree."""
+    picture = axes.imshow(
+        source.low - target.low,
+        extent=_extent(source.grid),
+        interpolation="nearest",
+        cmap="RdBu_r",
+        vmin=-_LARGEST_DIFFERENCE_M,
+        vmax=_LARGEST_DIFFERENCE_M,
+    )
+    axes.set_facecolor("0.75")
+    figure.colorbar(picture, ax=axes, label="metres", extend="both", shrink=0.8)
+
+
 def _draw_over(axes: Axes, source: Bev, target: Bev, T: Floats) -> None:
     """Draw the target in grey, and over it the source in colours of height."""
-    target = _thin(target)
-    around = grid_around(source, T)
-    step = max(1.0, max(around.shape) / _MOST_CELLS)
-    cell = around.cell * step
-    moved = warp_bev(
-        source, T, Grid(around.west, around.north, cell, *(int(n / step) + 1 for n in around.shape[::-1]))
-    )
+    moved = warp_bev(source, T, grid_around(source, T))
     grey = drawing.hillshade(target.top, target.grid.cell)
     _show(axes, np.where(grey == 0, 255, grey).astype(np.uint8), target.grid)
-    relief = drawing.shaded_relief(moved.top, cell)
+    relief = drawing.shaded_relief(moved.top, moved.grid.cell)
     opacity = np.where(np.isfinite(moved.top), round(255 * _SOURCE_OPACITY), 0).astype(np.uint8)
     _show(axes, np.dstack([relief, opacity]), moved.grid)
     extents = np.array([_extent(target.grid), _extent(moved.grid)])
@@ -92,11 +100,40 @@ def _draw_over(axes: Axes, source: Bev, target: Bev, T: Floats) -> None:
     axes.set_ylim(extents[:, 2].min(), extents[:, 3].max())
 
 
-def _thin(bev: Bev) -> Bev:
-    """Return every n-th cell of a raster, at most so many a side as a panel shows."""
-    top, cell, _ = drawing.thinned(bev, _MOST_CELLS)
-    grid = Grid(bev.grid.west, bev.grid.north, cell, top.shape[1], top.shape[0])
-    return replace(bev, grid=grid, top=np.ascontiguousarray(top))
+def _readable(bev: Bev) -> Bev:
+    """Join cells until nearly all within the cloud's outline are filled, and the raster fits a panel."""
+    blocks = int((coarsen(bev, _BLOCK_CELLS).count > 0).sum())
+    share = float((bev.count > 0).sum()) / max(1, blocks * _BLOCK_CELLS**2)
+    # by Poisson's law for points spread at random
+    per_cell = -math.log1p(-min(max(share, 1e-4), 1.0 - 1e-4))
+    to_fill = math.sqrt(-math.log1p(-_FILLED_SHARE) / per_cell)
+    factor = max(1, round(to_fill), -(-max(bev.grid.shape) // _MOST_CELLS))
+    return coarsen(bev, factor)
+
+
+def _middle(source: Bev, target: Bev) -> tuple[Bev, Bev]:
+    """Cut two rasters of one grid to a window about the middle of what both fill."""
+    grid = source.grid
+    both = np.argwhere(np.isfinite(source.top) & np.isfinite(target.top))
+    if not len(both):
+        return source, target
+    windows = []
+    for size, centre in zip(grid.shape, np.median(both, axis=0), strict=True):
+        start = int(np.clip(centre - _DETAIL_CELLS / 2, 0, max(0, size - _DETAIL_CELLS)))
+        windows.append(slice(start, min(size, start + _DETAIL_CELLS)))
+    rows, columns = windows
+    cut = Grid(
+        grid.west + columns.start * grid.cell,
+        grid.north - rows.start * grid.cell,
+        grid.cell,
+        columns.stop - columns.start,
+        rows.stop - rows.start,
+    )
+    return _cut(source, cut, rows, columns), _cut(target, cut, rows, columns)
+
+
+def _cut(bev: Bev, grid: Grid, rows: slice, columns: slice) -> Bev:
+    return Bev(grid, bev.top[rows, columns], bev.low[rows, columns], bev.count[rows, columns])
 
 
 def _show(axes: Axes, picture: drawing.Picture, grid: Grid) -> None:
