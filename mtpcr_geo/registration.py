@@ -26,9 +26,8 @@ from mtpcr_geo.core.types import Floats, Pair, Verdict
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.export.apply import move, moved_by, write_moved
 from mtpcr_geo.io.memory import cloud_of, is_array
-from mtpcr_geo.pipeline.options import OUTPUT_NAMES, RegisterOptions
+from mtpcr_geo.pipeline.options import OUTPUT_NAMES, RegisterOptions, first_problem
 from mtpcr_geo.pipeline.records import StageRecord
-from mtpcr_geo.pipeline.registry import first_problem
 from mtpcr_geo.pipeline.runner import RunResult, run
 from mtpcr_geo.pipeline.stage import Progress, Stage, chained
 from mtpcr_geo.pipeline.stages.memory import MemoryReader

@@ -14,6 +14,7 @@ from mtpcr_geo.core.recorder import NullRecorder
 from mtpcr_geo.core.system import peak_memory_mb
 from mtpcr_geo.core.types import Pair, Side, Verdict
 from mtpcr_geo.crs.chain import TransformChain
+from mtpcr_geo.pipeline.options import Force
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 
 TransformFormat = Literal["json", "cloudcompare", "pdal"]
@@ -22,7 +23,7 @@ TransformFormat = Literal["json", "cloudcompare", "pdal"]
 class ApplyOptions(StageOptions):
     """Options of mtpcr.apply."""
 
-    force: bool = Field(False, description="return the moved cloud though the verdict is refused")
+    force: Force = False
 
 
 class Apply(Stage):
@@ -156,7 +157,7 @@ class TransformFileOptions(FileOptions):
         description="json for mtpcr-geo apply, a cloudcompare matrix, or a pdal pipeline; "
         "where not given, .pdal.json means pdal, .txt means cloudcompare, all else json",
     )
-    force: bool = Field(False, description="write it though the verdict refuses it")
+    force: Force = False
 
 
 class WriteTransform(EvidenceWriter):
