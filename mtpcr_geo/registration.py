@@ -13,13 +13,13 @@ from typing import Any
 from pydantic import ValidationError
 
 from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.progress import Progress
 from mtpcr_geo.core.types import Floats, Pair, Verdict
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.pipeline import grammar
 from mtpcr_geo.pipeline.options import OUTPUT_NAMES, RegisterOptions
 from mtpcr_geo.pipeline.registry import first_problem
 from mtpcr_geo.pipeline.runner import RunResult, Settings, execute
-from mtpcr_geo.pipeline.stage import Progress
 from mtpcr_geo.pipeline.steps import steps_of, without_defaults
 
 

@@ -18,7 +18,7 @@ from mtpcr_geo.core.progress import NoProgress
 from mtpcr_geo.io.outputs import OutputSet
 
 if TYPE_CHECKING:
-    from mtpcr_geo.pipeline.stage import Progress
+    from mtpcr_geo.core.progress import Progress
 
 
 def simulated(

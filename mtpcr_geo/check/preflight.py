@@ -22,9 +22,9 @@ from mtpcr_geo.io.sample import Scan, scan
 from mtpcr_geo.method.bev import Density, choose_cell, density, grid_around
 
 if TYPE_CHECKING:
+    from mtpcr_geo.core.progress import Progress
     from mtpcr_geo.crs import Vertical
     from mtpcr_geo.method.overlap import Overlap
-    from mtpcr_geo.pipeline.stage import Progress
 
 Floats = NDArray[np.float64]
 Frames = tuple[WorkFrame, FrameLink, FrameLink]

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.progress import Progress
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.pipeline import grammar
 from mtpcr_geo.pipeline.api import metadata_of, read_text
 from mtpcr_geo.pipeline.runner import RunResult, Settings, execute, validate
-from mtpcr_geo.pipeline.stage import Progress
 
 
 def run_pipeline(

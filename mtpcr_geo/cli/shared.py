@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from mtpcr_geo.pipeline.stage import Progress
+    from mtpcr_geo.core.progress import Progress
 
 Verbose = Annotated[
     bool, typer.Option("--verbose", "-v", help="Say what every stage did and how long it took.")

@@ -13,7 +13,7 @@ from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.io.write import returning_scales, write_cloud
 
 if TYPE_CHECKING:
-    from mtpcr_geo.pipeline.stage import Progress
+    from mtpcr_geo.core.progress import Progress
 
 
 def apply_transform(

@@ -14,7 +14,7 @@ from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud
 from mtpcr_geo.core.errors import InputError
 
 if TYPE_CHECKING:
-    from mtpcr_geo.pipeline.stage import Progress
+    from mtpcr_geo.core.progress import Progress
 
 BUDGET = 4_000_000
 FEWEST_POINTS = 100

@@ -21,7 +21,7 @@ from mtpcr_geo.io.waveform import append_waveforms
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from mtpcr_geo.pipeline.stage import Progress
+    from mtpcr_geo.core.progress import Progress
 
 Floats = NDArray[np.float64]
 Move = Callable[[Floats], Floats]

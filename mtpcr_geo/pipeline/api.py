@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import InputError
+from mtpcr_geo.core.progress import Progress
 from mtpcr_geo.pipeline import grammar
 from mtpcr_geo.pipeline.runner import RunResult, Settings, execute, validate
-from mtpcr_geo.pipeline.stage import Progress, Value
+from mtpcr_geo.pipeline.stage import Value
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.types import Pair, Verdict

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError, RegistrationError
-from mtpcr_geo.core.progress import NoProgress
+from mtpcr_geo.core.progress import NoProgress, Progress
 from mtpcr_geo.core.system import versions
 from mtpcr_geo.core.types import Pair, Verdict
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.pipeline.grammar import StageSpec
 from mtpcr_geo.pipeline.plan import plan
-from mtpcr_geo.pipeline.stage import Progress, RunContext, Stage, Value
+from mtpcr_geo.pipeline.stage import RunContext, Stage, Value
 
 
 @dataclass(frozen=True)
