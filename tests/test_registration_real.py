@@ -108,5 +108,6 @@ def test_a_far_shift_of_both_changes_nothing(shared_data: Path, tmp_path: Path) 
             local=True, level="none", recording=False,
         )  # fmt: skip
         assert found.pair is not None
+        assert found.pair.T_target_source is not None
         results.append(found.pair.T_target_source)
     assert np.abs(results[0] - results[1]).max() < 1e-6

@@ -11,6 +11,7 @@ from conftest import REPOSITORY
 
 import mtpcr_geo
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.pipeline import grammar
 from mtpcr_geo.pipeline.options import RegisterOptions
@@ -75,6 +76,7 @@ def test_dumped_pipeline_gives_the_same_bits(registered, town_files, tmp_path):
     stages = build_pipeline(*town_files, tmp_path / "again", RegisterOptions())
     text = grammar.dump(stages)
     again = execute(grammar.link(grammar.parse(text)), Settings())
+    assert again.pair is not None
     assert TransformChain.of(again.pair).T_file.tobytes() == result.T_target_source.tobytes()
     for name in ("transform.cloudcompare.txt", "bev/source.tif", "registered.laz"):
         first, second = (out / name).read_bytes(), (tmp_path / "again" / name).read_bytes()
@@ -94,7 +96,10 @@ def test_ready_pipelines_without_pdal(name, town_files, tmp_path, monkeypatch):
     pipeline = mtpcr_geo.Pipeline(ready(name), [f"--target.filename={target}", f"--source.filename={source}"])
     pipeline.validate()
     assert files_below(tmp_path) == []
-    assert pipeline.execute() == pipeline.stages["source"].count
+    source_cloud = pipeline.stages["source"]
+    assert isinstance(source_cloud, Cloud)
+    assert pipeline.execute() == source_cloud.count
+    assert pipeline.verdict is not None
     assert pipeline.verdict.name == "accepted"
     assert (tmp_path / "out" / "registered.laz").exists()
 
@@ -117,6 +122,7 @@ def test_composite_gives_what_its_steps_give(registered, town_files):
     source, target = town_files
     pipeline = mtpcr_geo.Pipeline([str(target), str(source), {"type": "mtpcr.register"}])
     pipeline.execute()
+    assert pipeline.pair is not None
     assert TransformChain.of(pipeline.pair).T_file.tobytes() == registered[0].T_target_source.tobytes()
 
 
@@ -142,6 +148,7 @@ def test_refused_run_keeps_evidence_and_writes_no_result(town_files, tmp_path):
     next(stage for stage in stages if stage["type"] == "mtpcr.assess")["margin"] = 1e9
     result = execute(grammar.link(grammar.parse(grammar.dump(stages))))
     written = {path.name for path in files_below(tmp_path)}
+    assert result.verdict is not None
     if result.verdict.name == "refused":
         assert not written & {"registered.laz", "transform.json"}
     assert {"run.json", "ties.gpkg", "source.tif"} <= written
