@@ -10,22 +10,36 @@ from pyproj import CRS
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.grid import Grid
-from mtpcr_geo.core.types import Bev, Hypothesis, Matches, Pair, Side, TiePoints, Verdict
+from mtpcr_geo.core.types import (
+    Bev,
+    Hypothesis,
+    IcpResult,
+    IcpRound,
+    IcpTrial,
+Levelling,
+    Matches,
+    Pair,
+    Refinement,
+    Side,
+    Solution,
+    TiePoints,
+    Verdict,
+)  # fmt: skip
 from mtpcr_geo.crs import FrameLink, WorkFrame
 
-ICP_REPORT = {
-    "method": "gicp",
-    "tried": {
-        "ground": {"surface_residual": 0.52, "tie_points": 14},
-        "near": {"surface_residual": 0.31, "tie_points": 15},
-    },
-    "chosen": "near",
-    "followed": True,
-    "lost_tie_points": False,
-    "rounds": [
-        {"reach_m": reach, "iterations": 9, "inliers": 800, "converged": True} for reach in (1.0, 0.5)
-    ],
-}
+ICP_RESULT = IcpResult(
+    np.eye(4),
+    "gicp",
+    voxel_m=0.5,
+    points_source=1000,
+    points_target=3000,
+    tried={"ground": IcpTrial(0.52, 14), "near": IcpTrial(0.31, 15)},
+    chosen="near",
+    followed=True,
+    lost_tie_points=False,
+    rounds=(IcpRound(1.0, 9, 800, True), IcpRound(0.5, 9, 800, True)),
+    rotated_deg=0.1,
+)
 ORIGIN = np.array([367_000.0, 5_820_000.0, 30.0])
 YAW = np.deg2rad(33.0)
 SHIFT = np.array([12.5, -7.25, 1.5])
@@ -116,7 +130,7 @@ def make_sides(n: int = 20_000, crs: str | None = "EPSG:25833", tilt: float = 0.
         link = FrameLink(side_crs, origin)
         cloud = ArrayCloud(link.to_file(xyz), side_crs, f"{role}.laz")
         bev = rasterise(transforms.apply(T, xyz), cell)
-        return Side(role, cloud, link, xyz, T, {"method": "none" if not tilt else "ransac"}, bev)
+        return Side(role, cloud, link, xyz, True, Levelling(T, "plane" if tilt else "none"), bev)
 
     target = side("target", target_xyz, target_origin, np.eye(4))
     return target, side("source", source_xyz, np.zeros(3), T_level)
@@ -153,7 +167,7 @@ def make_pair(
         target.bev.grid.to_pixel(target_xyz[:, :2]),
         score,
         hypotheses,
-        {"matcher": "correlation"},
+        report={"matcher": "correlation"},
     )
     pair = pair.with_(matches=matches)
     if state == "matched":
@@ -168,8 +182,8 @@ def make_pair(
     T_work = T @ source.T_level_work
     pair = pair.with_(
         T_target_source=T_work,
-        solve_report={"iterations": 4},
-        refine_report={"icp": ICP_REPORT},
+        solution=Solution(T, inlier, 4, 0.5),
+        refinement=Refinement(T_work, T_work, icp=ICP_RESULT),
     )
     if state == "solved":
         return pair

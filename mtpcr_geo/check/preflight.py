@@ -19,7 +19,7 @@ from mtpcr_geo.core.frames import box_points
 from mtpcr_geo.crs import FrameLink, WorkFrame, resolve_frames
 from mtpcr_geo.io.las import LasCloud, check_distinct, open_cloud
 from mtpcr_geo.io.sample import Scan, scan
-from mtpcr_geo.method.bev import Density, choose_cell, density, grid_around
+from mtpcr_geo.method.bev import choose_cell, coverage_of, grid_around
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.progress import Progress
@@ -197,7 +197,7 @@ class _Check:
         except (CrsError, InputError):
             return  # said where the common frame is settled
         try:
-            dense = density(sample, cloud.count)
+            dense = coverage_of(sample, points=cloud.count)
         except RegistrationError as error:
             looked.too_large = error
             return
@@ -205,7 +205,7 @@ class _Check:
         outline = sample if looked.scan.complete else link.to_work(box_points(looked.bounds))
         low, high = outline.min(axis=0), outline.max(axis=0)
         looked.measured = points.Measured(
-            sample, low, high, float(link.origin[2]), dense.per_m2, dense.area_m2
+            sample, low, high, float(link.origin[2]), dense.per_m2, dense.occupied_m2
         )
         found += points.density_findings(looked.measured, cloud.count, role)
         found += points.plan_findings(looked.measured, role)
@@ -279,7 +279,7 @@ class _Check:
         sides = [(looked, looked.measured) for looked in self.looked.values() if looked.measured is not None]
         if self.refusals or not sides:
             return
-        cell = choose_cell(*(Density(measured.area_m2, measured.per_m2) for _, measured in sides))
+        cell = choose_cell(*(measured.per_m2 for _, measured in sides))
         for looked, measured in sides:
             with self.stopping("raster-size", looked.role):
                 grid_around(measured.low, measured.high, cell)

@@ -46,3 +46,14 @@ class Grid:
         x = self.west + (pixel[:, 0] + 0.5) * self.cell
         y = self.north - (pixel[:, 1] + 0.5) * self.cell
         return np.stack([x, y], axis=1)
+
+    def cells(self, xy: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return column and row of the cells that hold (n, >=2) points, in metres, in the grid or not."""
+        scale = 1.0 / self.cell
+        column = np.floor((xy[:, 0] - self.west) * scale).astype(np.int64)
+        row = np.floor((self.north - xy[:, 1]) * scale).astype(np.int64)
+        return column, row
+
+    def holds(self, column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which of (n,) columns and rows lie in the grid."""
+        return (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)

@@ -1,28 +1,53 @@
-"""The values that travel from stage to stage: immutable, and filled in one step at a time."""
+"""The values that one step hands to the next: immutable, typed, filled in one step at a time."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats as Floats
+from mtpcr_geo.core.arrays import Grey, Mask
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.grid import Grid
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.frames import FrameLink, WorkFrame
 
-Floats = NDArray[np.float64]
 VerdictName = Literal["accepted", "doubtful", "refused"]
+IcpMethod = Literal["gicp", "point_to_plane", "point_to_point"]
+LevellingMethod = Literal["none", "plane", "verticals"]
 Look = Literal["band_pass", "paper", "paper_normalised", "grey", "grey_printed"]
 """How the image of a raster is made that keypoint matchers see, see `mtpcr_geo.method.images.image_of`."""
 
 
-@dataclass(frozen=True)
-class Bev:
+class ComparesArrays:
+    """Compares dataclasses field by field, arrays exactly (NaN equal to NaN); instances have no hash."""
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether both are of one class and every field is equal."""
+        if type(self) is not type(other):
+            return NotImplemented
+        names = [one.name for one in fields(self)]  # type: ignore[arg-type]
+        return all(_equal(getattr(self, name), getattr(other, name)) for name in names)
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+def _equal(a: object, b: object) -> bool:
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        if not (isinstance(a, np.ndarray) and isinstance(b, np.ndarray)):
+            return False
+        return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+    return bool(a == b)
+
+
+@dataclass(frozen=True, eq=False)
+class Bev(ComparesArrays):
     """A height raster seen from above.
 
     Attributes:
@@ -38,10 +63,16 @@ class Bev:
     low: NDArray[np.float32]
     count: NDArray[np.uint32]
 
+    def __repr__(self) -> str:
+        """Return size, cell and the share of filled cells in one line."""
+        filled = float((self.count > 0).mean()) if self.count.size else 0.0
+        grid = self.grid
+        return f"<Bev {grid.width} x {grid.height} cells of {grid.cell:g} m, {filled:.0%} filled>"
 
-@dataclass(frozen=True)
-class Appearance:
-    """What keypoint matchers see of a raster.
+
+@dataclass(frozen=True, eq=False)
+class Appearance(ComparesArrays):
+    """The images that keypoint matchers see of a raster.
 
     Attributes:
         look: how the image was made, see `mtpcr_geo.method.images.image_of`.
@@ -51,12 +82,44 @@ class Appearance:
     """
 
     look: Look
-    plain: NDArray[np.uint8]
-    image: NDArray[np.uint8]
+    plain: Grey
+    image: Grey
 
 
-@dataclass(frozen=True)
-class Side:
+@dataclass(frozen=True, eq=False)
+class Levelling(ComparesArrays):
+    """How a cloud was made upright.
+
+    Attributes:
+        T_level_work: 4x4 rotation about the sample's centre, work to levelled coordinates.
+        method: "none", "plane" (the paper) or "verticals".
+        tilt_deg: angle between the cloud's z axis and the vertical found, degrees.
+        why: why it was kept as it is, where it was.
+        plane_tilt_deg, plane_inlier_share: tilt of the ground plane, degrees, and share of points on it.
+        verticals: points on walls, poles and trunks that agree on the vertical.
+        verticals_spread_deg: their robust spread about it, degrees.
+        plane_to_verticals_deg: angle between the plane's normal and the vertical, degrees.
+
+    """
+
+    T_level_work: Floats = field(default_factory=lambda: np.eye(4))
+    method: LevellingMethod = "none"
+    tilt_deg: float = 0.0
+    why: str | None = None
+    plane_tilt_deg: float | None = None
+    plane_inlier_share: float | None = None
+    verticals: int | None = None
+    verticals_spread_deg: float | None = None
+    plane_to_verticals_deg: float | None = None
+
+    def audit(self) -> dict[str, Any]:
+        """Return everything but the matrix, without what is not known, for the audit."""
+        names = [one.name for one in fields(self) if one.name != "T_level_work"]
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class Side(ComparesArrays):
     """One of the two clouds on its way through the run.
 
     Attributes:
@@ -64,8 +127,8 @@ class Side:
         cloud: the cloud as read.
         link: takes its file coordinates to its work coordinates (metric, near zero) and back.
         sample: (n, 3) float64 work coordinates, at most the budget; the whole cloud where it fits.
-        T_level_work: 4x4 levelling rotation, from work to levelled coordinates (identity if upright).
-        level_report: how it was levelled, for the audit.
+        complete: whether the sample is the whole cloud.
+        levelling: how it was made upright.
         bev: its height raster, in levelled coordinates.
         appearance: the image made of the raster, where one was asked for.
 
@@ -75,10 +138,15 @@ class Side:
     cloud: Cloud
     link: FrameLink
     sample: Floats
-    T_level_work: Floats = field(default_factory=lambda: np.eye(4))
-    level_report: dict[str, Any] = field(default_factory=dict)
+    complete: bool = True
+    levelling: Levelling = field(default_factory=Levelling)
     bev: Bev | None = None
     appearance: Appearance | None = None
+
+    @property
+    def T_level_work(self) -> Floats:
+        """4x4 levelling rotation, from work to levelled coordinates (identity if upright)."""
+        return self.levelling.T_level_work
 
     @property
     def levelled_sample(self) -> Floats:
@@ -93,7 +161,7 @@ class Hypothesis:
     Attributes:
         yaw: radians, counter-clockwise.
         shift: (2,) metres.
-        score: the correlation score by which hypotheses are ranked; higher is better.
+        score: the score by which hypotheses are ranked; higher is better.
         overlap_cells: cells that both images fill under this pose.
 
     """
@@ -104,15 +172,19 @@ class Hypothesis:
     overlap_cells: int = 0
 
 
-@dataclass(frozen=True)
-class Matches:
+@dataclass(frozen=True, eq=False)
+class Matches(ComparesArrays):
     """Point pairs in the two BEVs.
 
     Attributes:
         source_px, target_px: (n, 2) float64 pixel coordinates (column, row), pixel centres at integers.
         score: (n,) in 0..1.
         hypotheses: candidates in falling order of score; the first is the one the matches follow.
-        report: what the matcher wants on record.
+        search_radius_m: how far a match may lie from where the best hypothesis puts it, metres; None from
+            matchers that search the whole raster.
+        margin: strength of the best hypothesis over the next distinct one; None where there is no telling.
+        support: share of the patches in the overlap that agree on the pose; None likewise.
+        report: further figures of the matcher, for the audit only.
         source_keypoints, target_keypoints: (k, 2) pixels of all keypoints, matched or not; None from
             matchers that have none.
         matcher: what found them, so that FOCUS can ask it again.
@@ -124,16 +196,22 @@ class Matches:
     target_px: Floats
     score: Floats
     hypotheses: tuple[Hypothesis, ...] = ()
-    report: dict[str, Any] = field(default_factory=dict)
+    search_radius_m: float | None = None
+    margin: float | None = None
+    support: float | None = None
+    report: Mapping[str, Any] = field(default_factory=dict)
     source_keypoints: Floats | None = None
     target_keypoints: Floats | None = None
     matcher: Any = None
     before_focus: Matches | None = None
 
+    def __len__(self) -> int:
+        return len(self.score)
 
-@dataclass(frozen=True)
-class TiePoints:
-    """Matches lifted to 3D, in levelled work coordinates, metres.
+
+@dataclass(frozen=True, eq=False)
+class TiePoints(ComparesArrays):
+    """Matches mapped back to 3D (Eq. 5), in levelled work coordinates, metres.
 
     Attributes:
         source, target: (n, 3) float64.
@@ -148,8 +226,209 @@ class TiePoints:
     target: Floats
     score: Floats
     fold: NDArray[np.int64]
-    held_out: NDArray[np.bool_]
-    inlier: NDArray[np.bool_]
+    held_out: Mask
+    inlier: Mask
+
+    def __len__(self) -> int:
+        return len(self.score)
+
+
+@dataclass(frozen=True)
+class SolveSettings:
+    """How a transform is solved from tie points.
+
+    Attributes:
+        robust_start: begin from the yaw and shift that RANSAC finds; else from all tie points, as in the
+            paper.
+        upright: solve yaw and shift, trusting the levelling; else all six degrees of freedom.
+        tries: pairs of tie points that RANSAC tries.
+        seed: of RANSAC.
+
+    """
+
+    robust_start: bool = True
+    upright: bool = True
+    tries: int = 2000
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Solution(ComparesArrays):
+    """Result of the iterative SVD, in levelled coordinates.
+
+    Attributes:
+        T: 4x4 from source to target.
+        inlier: (n,) tie points within the final threshold.
+        iterations: rounds until nothing changed.
+        threshold: final residual threshold, metres.
+        settings: how it was solved.
+        used: tie points it was solved from.
+
+    """
+
+    T: Floats
+    inlier: Mask
+    iterations: int
+    threshold: float
+    settings: SolveSettings = SolveSettings()
+    used: int = 0
+
+    def audit(self) -> dict[str, Any]:
+        """Return the figures of the solution, for the audit."""
+        return {
+            "used": self.used,
+            "inliers": int(self.inlier.sum()),
+            "iterations": self.iterations,
+            "threshold_m": self.threshold,
+            "yaw_deg": float(np.degrees(transforms.yaw_of(self.T[:3, :3]))),
+            "settings": {one.name: getattr(self.settings, one.name) for one in fields(self.settings)},
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class GroundFit(ComparesArrays):
+    """Height, and tilt where wanted, settled on the ground that both clouds see.
+
+    Attributes:
+        T: 4x4 from source to target, work coordinates.
+        cells: cells where both see the ground.
+        agreeing: of these, cells that agree with the fit.
+        rise_m: metres by which the source was raised; None where too little ground is seen.
+        spread_m: robust spread of the agreeing cells' height differences, metres.
+        tilt_deg: angle by which the source was tilted, degrees.
+        followed: whether the transform was taken over.
+
+    """
+
+    T: Floats
+    cells: int
+    agreeing: int = 0
+    rise_m: float | None = None
+    spread_m: float | None = None
+    tilt_deg: float = 0.0
+    followed: bool = True
+
+    def audit(self) -> dict[str, Any]:
+        """Return the figures of the fit, for the audit."""
+        if self.rise_m is None:
+            return {"ground_cells": self.cells, "followed": self.followed}
+        return {
+            "ground_cells": self.cells,
+            "ground_cells_agreeing": self.agreeing,
+            "rise_m": self.rise_m,
+            "ground_spread_m": self.spread_m,
+            "tilt_deg": self.tilt_deg,
+            "followed": self.followed,
+        }
+
+
+@dataclass(frozen=True)
+class IcpRound:
+    """One round of ICP.
+
+    Attributes:
+        max_correspondence_distance_m: farthest correspondence, metres.
+        iterations: iterations done.
+        inliers: points with a correspondence at the end.
+        converged: whether it stood still.
+
+    """
+
+    max_correspondence_distance_m: float
+    iterations: int
+    inliers: int
+    converged: bool
+
+
+@dataclass(frozen=True)
+class IcpTrial:
+    """How well one candidate of the refinement fits.
+
+    Attributes:
+        surface_residual: how badly flat surfaces meet: 0 all meet, 1 none does.
+        tie_points: tie points that agree with it in plan.
+
+    """
+
+    surface_residual: float
+    tie_points: int
+
+
+@dataclass(frozen=True, eq=False)
+class IcpResult(ComparesArrays):
+    """What ICP came to, and which of its runs was followed.
+
+    Attributes:
+        T: 4x4 from source to target, work coordinates.
+        method: ICP variant.
+        voxel_m: thinning, metres.
+        points_source, points_target: points kept of each cloud.
+        tried: the candidates by name: starts and runs of ICP.
+        chosen: name of the candidate taken.
+        followed: whether it is a run of ICP.
+        lost_tie_points: whether a run whose surfaces met better was not followed, since it lost tie points.
+        rounds: rounds of the run that was followed.
+        rotated_deg: angle by which it turned the start, degrees; None where none was followed.
+
+    """
+
+    T: Floats
+    method: IcpMethod
+    voxel_m: float
+    points_source: int
+    points_target: int
+    tried: Mapping[str, IcpTrial]
+    chosen: str
+    followed: bool
+    lost_tie_points: bool
+    rounds: tuple[IcpRound, ...] = ()
+    rotated_deg: float | None = None
+
+    def audit(self) -> dict[str, Any]:
+        """Return the figures of the runs, for the audit."""
+        rounds: dict[str, Any] = {}
+        if self.rotated_deg is not None:
+            rounds = {"rounds": [vars(one) for one in self.rounds], "rotated_deg": self.rotated_deg}
+        return {
+            "method": self.method,
+            "voxel_m": self.voxel_m,
+            "points_source": self.points_source,
+            "points_target": self.points_target,
+            "tried": {name: vars(trial) for name, trial in self.tried.items()},
+            "chosen": self.chosen,
+            "followed": self.followed,
+            "lost_tie_points": self.lost_tie_points,
+            **rounds,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement(ComparesArrays):
+    """Result of the refinement.
+
+    Attributes:
+        T: 4x4 from source to target, work coordinates.
+        T_before: the same before the refinement.
+        ground_before: height and tilt settled before ICP, where that was asked for.
+        icp: what ICP came to, where it ran.
+        ground_after: height settled after ICP, where that was asked for.
+
+    """
+
+    T: Floats
+    T_before: Floats
+    ground_before: GroundFit | None = None
+    icp: IcpResult | None = None
+    ground_after: GroundFit | None = None
+
+    def audit(self) -> dict[str, Any]:
+        """Return what each step did, for the audit."""
+        steps: dict[str, GroundFit | IcpResult | None] = {
+            "ground_before": self.ground_before,
+            "icp": self.icp,
+            "ground_after": self.ground_after,
+        }
+        return {name: step.audit() for name, step in steps.items() if step is not None}
 
 
 @dataclass(frozen=True)
@@ -168,8 +447,8 @@ class Verdict:
     metrics: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Pair:
+@dataclass(frozen=True, eq=False)
+class Pair(ComparesArrays):
     """The state of a registration: two sides and what has been found so far.
 
     Attributes:
@@ -177,7 +456,8 @@ class Pair:
         frame: the work frame (target's).
         matches, tie_points: what links them, once found.
         T_target_source: 4x4 in work coordinates (source work -> target work), once solved.
-        solve_report, refine_report: how it came about, for the audit.
+        solution: how it was solved.
+        refinement: how it was refined.
         T_prior: 4x4 in work coordinates that was known beforehand, where a prior was asked for.
         verdict: the judgement, once made.
 
@@ -189,8 +469,8 @@ class Pair:
     matches: Matches | None = None
     tie_points: TiePoints | None = None
     T_target_source: Floats | None = None
-    solve_report: dict[str, Any] = field(default_factory=dict)
-    refine_report: dict[str, Any] = field(default_factory=dict)
+    solution: Solution | None = None
+    refinement: Refinement | None = None
     T_prior: Floats | None = None
     verdict: Verdict | None = None
 
@@ -199,6 +479,24 @@ class Pair:
         """The larger cell of both rasters, metres: how exact matches can be; 1 where there is none."""
         cells = [side.bev.grid.cell for side in (self.source, self.target) if side.bev is not None]
         return max(cells, default=1.0)
+
+    @property
+    def T_level_target_source(self) -> Floats:
+        """4x4 from levelled source to levelled target coordinates.
+
+        Raises:
+            ValueError: if the pair has no transform yet.
+
+        """
+        if self.T_target_source is None:
+            raise ValueError("the pair has no transform yet")
+        return self.levelled(self.T_target_source)
+
+    def levelled(self, T_target_source: Floats) -> Floats:
+        """Take a 4x4 between work coordinates to the same between levelled coordinates."""
+        return np.asarray(
+            self.target.T_level_work @ T_target_source @ transforms.inverse(self.source.T_level_work)
+        )
 
     def with_(self, **changes: Any) -> Pair:
         """Copy with some fields replaced."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.types import Floats, Pair, Side, Verdict
+from mtpcr_geo.core.types import Floats, IcpResult, Pair, Side, Verdict
 from mtpcr_geo.crs import FrameLink, TransformChain, facts_of
 from mtpcr_geo.export.tie_points import tie_positions
 from mtpcr_geo.export.transform import units_of
@@ -87,20 +87,23 @@ def transform_rows(pair: Pair) -> list[Row]:
             off = surface_residuals(pair)[inlier]
             plan, height = np.median(np.hypot(off[:, 0], off[:, 1])), np.median(np.abs(off[:, 2]))
             rows.append(("residual of those", f"median {plan:.2f} m in plan, {height:.2f} m in height"))
-    icp = pair.refine_report.get("icp")
-    if icp:
+    icp = pair.refinement.icp if pair.refinement is not None else None
+    if icp is not None:
         rows.append(("refined by", refinement_text(icp)))
     return rows
 
 
-def refinement_text(icp: Mapping[str, Any]) -> str:
-    """Say which of the refinements was taken, from the report of `mtpcr_geo.method.refine.follow_icp`."""
-    surface_residual = icp["tried"][icp["chosen"]]["surface_residual"]
-    if icp["followed"]:
-        rounds = ", ".join(f"{one['reach_m']:g}" for one in icp["rounds"])
-        return f"ICP ({icp['method']}) with reaches of {rounds} m; surface residual {surface_residual:.2f}"
-    why = "ICP lost the tie points" if icp["lost_tie_points"] else "after ICP surfaces met worse"
-    kept = {"tie_points": "the tie points alone", "ground": "tie points and ground"}[icp["chosen"]]
+def refinement_text(icp: IcpResult) -> str:
+    """Return which of the refinements was taken, and why, in one line."""
+    surface_residual = icp.tried[icp.chosen].surface_residual
+    if icp.followed:
+        rounds = ", ".join(f"{one.max_correspondence_distance_m:g}" for one in icp.rounds)
+        return (
+            f"ICP ({icp.method}) with correspondences up to {rounds} m; "
+            f"surface residual {surface_residual:.2f}"
+        )
+    why = "ICP lost the tie points" if icp.lost_tie_points else "after ICP surfaces met worse"
+    kept = {"tie_points": "the tie points alone", "ground": "tie points and ground"}[icp.chosen]
     return f"{kept}: {why}; surface residual {surface_residual:.2f}"
 
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats, Grey
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Matches
 
-Floats = NDArray[np.float64]
-Grey = NDArray[np.uint8]
 Advance = Callable[[int], object]
 
 
@@ -141,7 +140,7 @@ class Matcher(Protocol):
 
 
 def one_to_one(found: PixelMatches, apart_px: float = 1.0) -> PixelMatches:
-    """Keep the best of the pairs that share a place in either image, so that each tells something new.
+    """Keep the best of the pairs that share a place in either image, so that each adds something new.
 
     Args:
         found: pairs.
@@ -160,3 +159,23 @@ def one_to_one(found: PixelMatches, apart_px: float = 1.0) -> PixelMatches:
         seen[1].add(target)
         kept.append(order[rank])
     return found.take(np.array(kept, np.int64))
+
+
+LARGEST_MARGIN = 1000.0
+
+
+def margin_of(strengths: Sequence[float], floor: float = 0.0) -> float:
+    """Return how many times stronger the best hypothesis is than the next distinct one.
+
+    Args:
+        strengths: of the hypotheses, best first, each at least 0.
+        floor: what the next one counts at least, such as one match.
+
+    Returns:
+        The ratio, 1000 at most; 1 where there is no hypothesis, or the best is worth nothing.
+
+    """
+    if not strengths or strengths[0] <= 0.0:
+        return 1.0
+    following = max(strengths[1] if len(strengths) > 1 else 0.0, floor)
+    return LARGEST_MARGIN if following <= 0.0 else min(strengths[0] / following, LARGEST_MARGIN)

@@ -17,14 +17,13 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.statistics import chance_within, neg_log10_p
 from mtpcr_geo.core.types import Bev, Hypothesis, Matches
+from mtpcr_geo.match.base import margin_of
 from mtpcr_geo.match.patches import PatchMatches, match_patches
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.search import GlobalSearch, Layer, angle_between, distinct, score_nearby
 from mtpcr_geo.method.bev import coarsen
 from mtpcr_geo.method.images import channels
 from mtpcr_geo.method.solve import iterative_svd, ransac_upright
-
-Floats = NDArray[np.float64]
 
 SEARCH_CELLS_M = (8.0, 4.0, 2.0)
 LARGEST_SEARCH = 420
@@ -33,10 +32,9 @@ PEAKS_A_YAW = 3
 HYPOTHESES = 10
 DROPPED_BELOW = 0.5
 """Share of the best score below which a hypothesis is not followed further."""
-REACH_CELLS = 4
+RADIUS_CELLS = 4
 """How far the final patch matches may lie from where the pose puts them, cells."""
 AGREE_CELLS = 1.5
-LARGEST_MARGIN = 1000.0
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class CorrelationSettings:
     Attributes:
         yaw_step_deg: step of the search over all yaws.
         patch_m: edge of a patch of the local matches, metres.
-        reach_m: how far a patch may lie from where the hypothesis puts it, metres.
+        search_radius_m: how far a patch may lie from where the hypothesis puts it, metres.
         min_overlap_m2: smallest overlap considered, square metres.
         min_overlap_share: smallest overlap considered, as a share of the smaller raster.
         convincing_margin: best over next distinct score at fine cells that ends the search.
@@ -57,7 +55,7 @@ class CorrelationSettings:
 
     yaw_step_deg: float = 4.0
     patch_m: float = 24.0
-    reach_m: float = 6.0
+    search_radius_m: float = 6.0
     min_overlap_m2: float = 400.0
     min_overlap_share: float = 0.03
     convincing_margin: float = 1.5
@@ -115,7 +113,7 @@ class Candidate:
         if self.patches is None or self.supporting is None:
             return 0.0
         agreeing = max(int(self.supporting.sum()) - 2, 0)
-        return neg_log10_p(agreeing, len(self.patches), chance_within(AGREE_CELLS, REACH_CELLS - 0.5))
+        return neg_log10_p(agreeing, len(self.patches), chance_within(AGREE_CELLS, RADIUS_CELLS - 0.5))
 
     @property
     def strength(self) -> float:
@@ -160,7 +158,7 @@ def match(
         pool = _distinct([_score_patches(pyramid, c, settings, seed) for c in _worth_judging(pool)])
         if (
             pool
-            and margin_of(pool) >= settings.convincing_margin
+            and _margin(pool) >= settings.convincing_margin
             and pool[0].neg_log10_p >= settings.convincing_neg_log10_p
         ):
             break
@@ -173,11 +171,13 @@ def match(
     matches = best.patches
     assert matches is not None  # the best hypotheses are always judged by patches
     pivot = centre_of(source.grid)
+    margin = _margin(pool)
+    radius = (RADIUS_CELLS - 0.5) * source.grid.cell
     report = {
         "cell_m": source.grid.cell,
-        "reach_m": (REACH_CELLS - 0.5) * source.grid.cell,
+        "search_radius_m": radius,
         "searched": searched,
-        "margin": margin_of(pool),
+        "margin": margin,
         "support": best.support,
         "neg_log10_p": best.neg_log10_p,
         "support_next": max((c.support for c in pool[1:]), default=0.0),
@@ -190,6 +190,9 @@ def match(
         target_px=matches.target_px,
         score=np.clip(matches.score, 0.0, 1.0),
         hypotheses=tuple(c.pose.hypothesis(pivot) for c in pool),
+        search_radius_m=radius,
+        margin=margin,
+        support=best.support,
         report=report,
     )
 
@@ -231,11 +234,8 @@ def search_factors(source: Bev, target: Bev) -> list[int]:
     return factors
 
 
-def margin_of(pool: Sequence[Candidate]) -> float:
-    """Strength of the best over that of the next distinct hypothesis, 1000 at most."""
-    if len(pool) < 2 or pool[1].strength <= 0.0:
-        return LARGEST_MARGIN if pool and pool[0].strength > 0.0 else 1.0
-    return min(pool[0].strength / pool[1].strength, LARGEST_MARGIN)
+def _margin(pool: Sequence[Candidate]) -> float:
+    return margin_of([candidate.strength for candidate in pool])
 
 
 def _search(
@@ -314,14 +314,14 @@ def _score_patches(
     cell = source.grid.cell
     stride = max(4, round(settings.patch_m / 2 / cell))
     pose = candidate.pose
-    reach = max(REACH_CELLS, round(settings.reach_m / cell))
-    patches = match_patches(source, target, pose, window=reach, stride=stride)
+    radius = max(RADIUS_CELLS, round(settings.search_radius_m / cell))
+    patches = match_patches(source, target, pose, window=radius, stride=stride)
     corrected = _corrected(pose, patches, _vote(patches, source, target, seed), source, target)
     rescored = score_nearby(source, target, corrected, 1)[0]
     # patches that do not agree must not carry a good hypothesis away
     if rescored.score >= pose.score:
         pose = rescored
-    patches = match_patches(source, target, pose, window=REACH_CELLS, stride=stride)
+    patches = match_patches(source, target, pose, window=RADIUS_CELLS, stride=stride)
     return Candidate(pose, candidate.proposed, patches, _vote(patches, source, target, seed))
 
 

@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo.match.base import Features, Grey, PixelMatches
+from mtpcr_geo.core.arrays import Floats, Grey
+from mtpcr_geo.match.base import Features, PixelMatches
 
 Indices = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 BLOCK = 2048
 """Descriptors compared at once: bounds the distance matrix to some tens of MiB."""

@@ -15,14 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats, Grey
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Hypothesis, Matches
-from mtpcr_geo.match.base import Advance, Grey, ImageMatcher, PixelMatches, View, one_to_one
+from mtpcr_geo.match.base import Advance, ImageMatcher, PixelMatches, View, margin_of, one_to_one
 from mtpcr_geo.match.search import angle_between
 from mtpcr_geo.method.solve import ransac_upright
-
-Floats = NDArray[np.float64]
 
 TRIES = 20_000
 """Pairs of matches tried for a yaw and a shift: finds a pose that 2 % of the matches support."""
@@ -124,6 +123,8 @@ class KeypointMatcher:
                 f"{seen[1]} in the target's); they may be blank, too small, or of different places"
             )
         hypotheses = _hypotheses(tried)
+        # two matches agree on any pose, so that one more counts as the least of a next pose
+        margin = margin_of([one.score for one in hypotheses], floor=1.0)
         report: dict[str, Any] = {
             "method": self.name,
             "cell_m": [source.grid.cell, target.grid.cell],
@@ -133,7 +134,7 @@ class KeypointMatcher:
             "turn_agreeing": [int(o.agreeing.sum()) for o in tried],
             "turn_deg": float(np.degrees(best.turn)),
             "agreeing": int(best.agreeing.sum()),
-            "margin": margin_of(hypotheses),
+            "margin": margin,
             "tolerance_m": tolerance,
             "keypoints": [len(best.found.source_keypoints), len(best.found.target_keypoints)],
         }
@@ -142,9 +143,10 @@ class KeypointMatcher:
             best.found.target_px,
             best.found.score,
             hypotheses,
-            report,
-            best.found.source_keypoints,
-            best.found.target_keypoints,
+            margin=margin,
+            report=report,
+            source_keypoints=best.found.source_keypoints,
+            target_keypoints=best.found.target_keypoints,
         )
 
     def _sweep(self, yaw: float | None) -> list[float]:
@@ -259,13 +261,3 @@ def _hypotheses(tried: list[Orientation]) -> tuple[Hypothesis, ...]:
         if count and not alike:
             kept.append(Hypothesis(yaw, shift, float(count)))
     return tuple(kept)
-
-
-def margin_of(hypotheses: tuple[Hypothesis, ...]) -> float:
-    """Return how many times more matches agree on the best pose than on the next, if any do.
-
-    Repetitive scenes, such as rows of like houses, give several poses that many matches agree on.
-    """
-    if not hypotheses:
-        return 1.0
-    return hypotheses[0].score / (hypotheses[1].score if len(hypotheses) > 1 else 1.0)

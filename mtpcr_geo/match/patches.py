@@ -6,13 +6,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats, Image
 from mtpcr_geo.match.pose import Pose, source_from_target_pixels, warp_to
 from mtpcr_geo.match.search import FILLED, Layer, correlation_score
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

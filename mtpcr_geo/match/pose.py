@@ -6,13 +6,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats, Image
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Hypothesis
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Image
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.match.pose import Pose, centre_of, warp_to
 from mtpcr_geo.method.images import Channels
-
-Image = NDArray[np.float32]
 
 HEIGHT_FLOOR_M = 0.1
 STEP_FLOOR = 0.02

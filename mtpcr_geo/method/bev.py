@@ -1,20 +1,31 @@
-"""Bird's-eye-view height rasters: highest z, lowest z and count per cell, streamed (Eq. 2)."""
+"""Bird's-eye-view height rasters: highest z, lowest z and count per cell (Eq. 2), and their cells (Eq. 1).
+
+MT-PCR multiplies each cloud by a resolution RES (Eq. 1), so that a pixel of its image is ``1 / RES`` metres;
+here coordinates stay metres and ``1 / RES`` is the cell of the raster, which is the same thing. The paper's
+pixels are (i, j): i counts columns eastwards and j rows *northwards*; images have north up, so that
+row = height - 1 - j.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev
 
-Floats = NDArray[np.float64]
+Resolution = Literal["common", "eq1", "eq1_occupied"]
+Convention = Literal["centre", "ceil"]
+"""Which points a cell holds: those around its centre, or by the ceiling as Eq. 2 is printed."""
 
+FINEST_EQ1_CELL_M, COARSEST_EQ1_CELL_M = 0.1, 20.0
 MAX_CELLS = 64_000_000
 """Cells beyond which a raster is refused: 0.8 GiB for the three bands."""
 
@@ -52,11 +63,14 @@ class Rasteriser:
 
     Args:
         grid: where the raster lies; points outside it are left out.
+        convention: "centre": a cell holds what lies between its edges; "ceil": column i holds
+            ``ceil((x - xmin) / cell) = i`` and row j likewise, as Eq. 2 is printed, on a `ceil_grid`.
 
     """
 
-    def __init__(self, grid: Grid) -> None:
+    def __init__(self, grid: Grid, convention: Convention = "centre") -> None:
         self.grid = grid
+        self.convention = convention
         size = grid.width * grid.height
         self._top = np.full(size, -np.inf, np.float32)
         self._low = np.full(size, np.inf, np.float32)
@@ -65,22 +79,15 @@ class Rasteriser:
     def add(self, xyz: Floats) -> None:
         """Add (n, 3) points in the grid's metres."""
         grid = self.grid
-        column, row = self._cells(xyz)
-        inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
+        column, row = grid.cells(xyz) if self.convention == "centre" else _cells_by_ceiling(grid, xyz)
+        inside = grid.holds(column, row)
         cell = row * grid.width + column
         z = xyz[:, 2].astype(np.float32)
         if not inside.all():
             cell, z = cell[inside], z[inside]
         np.maximum.at(self._top, cell, z)
         np.minimum.at(self._low, cell, z)
-        self._count += np.bincount(cell, minlength=len(self._count)).astype(np.uint32)
-
-    def _cells(self, xyz: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the column and the row of (n, 3) points, inside the raster or not."""
-        grid = self.grid
-        column = np.floor((xyz[:, 0] - grid.west) * (1.0 / grid.cell)).astype(np.int64)
-        row = np.floor((grid.north - xyz[:, 1]) * (1.0 / grid.cell)).astype(np.int64)
-        return column, row
+        np.add.at(self._count, cell, np.uint32(1))
 
     def finish(self) -> Bev:
         """Return the raster of everything added so far."""
@@ -90,12 +97,51 @@ class Rasteriser:
         return Bev(self.grid, top, low, self._count.reshape(self.grid.shape))
 
 
-def rasterise(chunks: Iterable[Floats], grid: Grid) -> Bev:
-    """Rasterise streamed (n, 3) points on a grid (Eq. 2, with pixel centres)."""
-    rasteriser = Rasteriser(grid)
+def ceil_grid(minimum: Floats, maximum: Floats, cell: float) -> Grid:
+    """Lay the grid of Eq. 2 as printed: column i holds ``ceil((x - xmin) / cell) = i``, from 0.
+
+    Column 0 holds what lies exactly at xmin and nothing else; likewise row j = 0.
+
+    Args:
+        minimum, maximum: (2,) or (3,) bounds of the points, metres.
+        cell: edge of a cell, metres.
+
+    """
+    width, height = (np.ceil((np.asarray(maximum[:2]) - minimum[:2]) / cell) + 1).astype(int)
+    north = float(minimum[1]) + (int(height) - 1) * cell
+    return Grid(float(minimum[0]) - cell, north, cell, int(width), int(height))
+
+
+def _cells_by_ceiling(grid: Grid, xyz: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    west = grid.west + grid.cell
+    south = grid.north - (grid.height - 1) * grid.cell
+    i = np.ceil((xyz[:, 0] - west) / grid.cell).astype(np.int64)
+    j = np.ceil((xyz[:, 1] - south) / grid.cell).astype(np.int64)
+    return i, grid.height - 1 - j
+
+
+def rasterise(chunks: Iterable[Floats], grid: Grid, convention: Convention = "centre") -> Bev:
+    """Rasterise streamed (n, 3) points, metres, on a grid (Eq. 2; see `Rasteriser` for the convention)."""
+    rasteriser = Rasteriser(grid, convention)
     for chunk in chunks:
         rasteriser.add(chunk)
     return rasteriser.finish()
+
+
+def make_bev(xyz: Floats, cell: float, convention: Convention = "centre") -> Bev:
+    """Rasterise a cloud held in memory over its own bounds.
+
+    Args:
+        xyz: (n, 3) levelled points, metres.
+        cell: edge of a cell, metres.
+        convention: which points a cell holds, see `Rasteriser`.
+
+    Raises:
+        RegistrationError: if the raster would not fit into memory at that cell size.
+
+    """
+    lay = grid_around if convention == "centre" else ceil_grid
+    return rasterise([xyz], lay(*transforms.bounds(xyz), cell), convention)
 
 
 def coarsen(bev: Bev, factor: int) -> Bev:
@@ -134,41 +180,142 @@ def coarsen(bev: Bev, factor: int) -> Bev:
 
 
 @dataclass(frozen=True)
-class Density:
+class Coverage:
     """How densely a cloud covers the ground.
 
     Attributes:
-        area_m2: area of the occupied cells of 2 m.
-        per_m2: points per occupied square metre.
+        points: points in the whole cloud.
+        occupied_m2: area of its occupied cells of 2 m, square metres.
+        box_m2: area of its levelled bounding box, square metres.
 
     """
 
-    area_m2: float
-    per_m2: float
+    points: int
+    occupied_m2: float
+    box_m2: float
+
+    @property
+    def per_m2(self) -> float:
+        """Points per occupied square metre."""
+        return self.points / self.occupied_m2
 
 
-def density(xyz: Floats, count: int) -> Density:
-    """Measure the density over occupied area, not over the bounding box (cf. Eq. 1).
+def coverage_of(xyz: Floats, levelled: Floats | None = None, points: int | None = None) -> Coverage:
+    """Measure how densely a cloud covers the ground.
 
     Args:
         xyz: (n, 3) the cloud, or a uniform sample of it, metres.
-        count: number of points in the whole cloud.
+        levelled: (n, 3) the same, levelled, for the bounding box; `xyz` itself if None.
+        points: number of points in the whole cloud; n if None.
 
     """
     low, high = transforms.bounds(xyz[:, :2])
     grid = grid_around(low, high, OCCUPANCY_CELL_M)
-    area = int((rasterise([xyz], grid).count > 0).sum()) * OCCUPANCY_CELL_M**2
-    return Density(area, count / area)
+    occupied = int((rasterise([xyz], grid).count > 0).sum()) * OCCUPANCY_CELL_M**2
+    low, high = (low, high) if levelled is None else transforms.bounds(levelled[:, :2])
+    return Coverage(len(xyz) if points is None else points, occupied, float(np.prod(high - low)))
 
 
-def choose_cell(*densities: Density, finest: float = FINEST_AUTO_CELL_M) -> float:
+@dataclass(frozen=True)
+class Cells:
+    """Cells chosen for the rasters of some clouds.
+
+    Attributes:
+        cells_m: edge of each cloud's cells, metres.
+        gamma_m: the gamma of Eq. 1, metres, where the cells follow from it.
+
+    """
+
+    cells_m: tuple[float, ...]
+    gamma_m: float | None = None
+
+
+def choose_cells(
+    coverages: Sequence[Coverage],
+    *,
+    cell: float | None = None,
+    finest: float = FINEST_AUTO_CELL_M,
+    resolution: Resolution = "common",
+    gamma: float | None = None,
+) -> Cells:
+    """Choose the cells of the rasters: one for all, or one each by Eq. 1.
+
+    Args:
+        coverages: of the clouds.
+        cell: the cell that is wanted, metres; chosen from the densities if None.
+        finest: no finer cell is chosen than this, metres.
+        resolution: "common" for one cell; "eq1" and "eq1_occupied" for a cell of each cloud's own, from
+            points per area of the bounding box, as printed, or of the occupied ground.
+        gamma: the gamma of Eq. 1, metres; see `usual_gamma` if None.
+
+    Raises:
+        RegistrationError: if Eq. 1 gives a cell of no use.
+
+    """
+    usual = cell or choose_cell(*(one.per_m2 for one in coverages), finest=finest)
+    if resolution == "common":
+        return Cells((usual,) * len(coverages))
+    areas = [one.box_m2 if resolution == "eq1" else one.occupied_m2 for one in coverages]
+    densities = tuple(one.points / area for one, area in zip(coverages, areas, strict=True))
+    gamma = gamma or usual_gamma(densities, usual)
+    res = [resolution_of(one.points, area, gamma) for one, area in zip(coverages, areas, strict=True)]
+    return Cells(tuple(cell_of(one) for one in res), gamma)
+
+
+def choose_cell(*densities: float, finest: float = FINEST_AUTO_CELL_M) -> float:
     """Choose one cell size for both rasters, metres: set by the sparser cloud, in steps of half a metre.
 
     Args:
-        densities: of the clouds.
+        densities: points per occupied square metre of each cloud.
         finest: no finer than this, metres.
 
     """
-    sparsest = min(d.per_m2 for d in densities)
+    sparsest = min(densities)
     wanted = np.sqrt(POINTS_PER_CELL / sparsest)
     return float(np.clip(np.round(wanted * 2) / 2, finest, COARSEST_AUTO_CELL_M))
+
+
+def resolution_of(count: int, area_m2: float, gamma: float) -> float:
+    """Return RES, pixels per metre (Eq. 1): ``count * gamma / area``.
+
+    The printed area is that of the bounding box; `Coverage` has the occupied one
+    too, which is our variant. As ``count / area`` is per square metre and RES per metre, the unit of
+    gamma is the metre.
+
+    Args:
+        count: points in the cloud.
+        area_m2: area it covers, square metres.
+        gamma: the paper's hyperparameter, metres; it has no value there.
+
+    """
+    return count * gamma / area_m2
+
+
+def usual_gamma(densities: tuple[float, ...], cell: float) -> float:
+    """Choose gamma, metres, where the user gives none: both cells then have the geometric mean ``cell``.
+
+    Densities differ a hundredfold between surveys, and RES grows in step with them, so no single value
+    serves: 0.1 m suits ten points per square metre, and makes 30 m cells of 0.3.
+
+    Args:
+        densities: points per square metre of each cloud.
+        cell: the cell that one would choose for both, metres.
+
+    """
+    return float(1.0 / (cell * np.exp(np.mean(np.log(densities)))))
+
+
+def cell_of(res: float) -> float:
+    """Return the cell ``1 / RES`` in metres.
+
+    Raises:
+        RegistrationError: if it is of no use: below 0.1 m or above 20 m.
+
+    """
+    cell = 1.0 / res
+    if not FINEST_EQ1_CELL_M <= cell <= COARSEST_EQ1_CELL_M:
+        raise RegistrationError(
+            f"Eq. 1 gives a cell of {cell:.3g} m, outside {FINEST_EQ1_CELL_M:g} to "
+            f"{COARSEST_EQ1_CELL_M:g} m; give another gamma, or --no-res"
+        )
+    return cell

@@ -1,4 +1,4 @@
-"""Thinning the points of an overlap in ways that hang on the points, and not on the frame they stand in."""
+"""Thinning of points by voxels, in ways that depend only on the points and not on the frame they stand in."""
 
 from __future__ import annotations
 
@@ -6,46 +6,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats, Mask
 
-Floats = NDArray[np.float64]
-
-MOST_CUBES = 30_000_000
-DENSE_CUBES = 2.5
-"""Points a cube of the thinning above which cubes give their mean point, and below which all are taken."""
+MAX_VOXELS = 30_000_000
+DENSE_VOXELS = 2.5
+"""Mean points a voxel above which voxels give their mean point, and below which all points are taken."""
 
 LATTICE_M = 0.00037
-"""Shift of the thinning's cubes off whole millimetres, where points of a LAS scale lie in numbers."""
+"""Shift of the voxels off whole millimetres, on which points of a LAS scale lie."""
 
 
-def near(points: Floats, others: Floats, reach: float) -> NDArray[np.bool_]:
-    """Return which points may have one of the others within reach, by cubes of that edge."""
+def near(points: Floats, others: Floats, distance: float) -> Mask:
+    """Return which points may have one of the others within a distance.
+
+    Args:
+        points: (n, 3) metres.
+        others: (m, 3) metres.
+        distance: metres; voxels of at least this edge are compared, so a little farther ones pass too.
+
+    Returns:
+        (n,) False where there is certainly none.
+
+    """
     (low_p, high_p), (low_o, high_o) = transforms.bounds(points), transforms.bounds(others)
     span = np.maximum(high_p, high_o) - np.minimum(low_p, low_o)
-    edge = max(reach, float(np.cbrt(np.prod(span + 4 * reach) / MOST_CUBES)))
+    edge = max(distance, float(np.cbrt(np.prod(span + 4 * distance) / MAX_VOXELS)))
     low = np.minimum(low_p, low_o) - 2 * edge
     shape = np.floor(span / edge).astype(int) + 5
     filled = np.zeros(tuple(shape.tolist()), dtype=np.bool_)
     filled[tuple(np.floor((others - low) / edge).astype(np.int64).T)] = True
     for axis in range(3):
-        # cubes beside a filled one along each axis in turn: all 26 neighbours in the end
+        # voxels beside a filled one along each axis in turn: all 26 neighbours in the end
         ahead, behind = np.roll(filled, 1, axis), np.roll(filled, -1, axis)
         filled = filled | ahead | behind
     return np.asarray(filled[tuple(np.floor((points - low) / edge).astype(np.int64).T)])
 
 
-def thinned(xyz: Floats, number: NDArray[np.int64], voxel: float, most: int) -> Floats:
-    """Thin (n, 3) points to at most so many, (m, 3), in a way that hangs on the points and not on the frame.
+def thinned(xyz: Floats, number: NDArray[np.int64], voxel: float, max_points: int) -> Floats:
+    """Thin points to at most `max_points`, in a way that depends only on the points and not on the frame.
 
-    Dense clouds give one mean point a cube. Where cubes would hold hardly more than a point each, the
-    points are taken as they are, since a lattice of cubes in another CRS would cut them otherwise. What is
-    too many is left out by a hash of the cube, or of the point's number: if one comes or goes, the choice
+    Dense clouds give one mean point a voxel. Where voxels would hold hardly more than a point each, the
+    points are taken as they are, since a lattice of voxels in another CRS would cut them otherwise. What is
+    too many is left out by a hash of the voxel, or of the point's number: if one comes or goes, the choice
     among all others stays.
 
     Args:
-        xyz: points, metres.
+        xyz: (n, 3) points, metres.
         number: (n,) the points' numbers in their cloud.
-        voxel: edge of a cube, metres.
-        most: points at most.
+        voxel: edge of a voxel, metres.
+        max_points: points at most.
+
+    Returns:
+        (m, 3) metres.
 
     """
     import small_gicp
@@ -53,12 +65,12 @@ def thinned(xyz: Floats, number: NDArray[np.int64], voxel: float, most: int) -> 
     first = np.floor(transforms.bounds(xyz)[0] / voxel) - 1
     corner = first * voxel + LATTICE_M
     thin = np.asarray(small_gicp.voxelgrid_sampling(xyz - corner, voxel, 1).points())[:, :3]
-    if len(xyz) < DENSE_CUBES * len(thin):
+    if len(xyz) < DENSE_VOXELS * len(thin):
         names, thin = number[:, None], xyz - corner
     else:
         names = (np.floor(thin / voxel) + first).astype(np.int64)
-    if len(thin) > most:
-        thin = thin[np.sort(np.argpartition(_hash(names), most)[:most])]
+    if len(thin) > max_points:
+        thin = thin[np.sort(np.argpartition(_hash(names), max_points)[:max_points])]
     return thin + corner
 
 
@@ -69,3 +81,27 @@ def _hash(names: NDArray[np.int64]) -> NDArray[np.uint64]:
         key = (key ^ column) * np.uint64(0x9E3779B97F4A7C15)
         key ^= key >> np.uint64(29)
     return key
+
+
+def one_per_voxel(xyz: Floats, voxel: float, rng: np.random.Generator, max_points: int) -> Floats:
+    """Keep the first point of each voxel, and a random choice of those where they are too many.
+
+    Args:
+        xyz: (n, 3) points, metres.
+        voxel: edge of a voxel, metres.
+        rng: makes the random choice.
+        max_points: points at most.
+
+    Returns:
+        (m, 3) metres, in the order given.
+
+    """
+    if len(xyz) > 1_500_000:
+        xyz = xyz[rng.choice(len(xyz), 1_500_000, replace=False)]
+    low, high = transforms.bounds(xyz)
+    at = np.floor((xyz - low) / voxel).astype(np.int64)
+    span = np.floor((high - low) / voxel).astype(np.int64) + 1
+    _, first = np.unique((at[:, 0] * span[1] + at[:, 1]) * span[2] + at[:, 2], return_index=True)
+    if len(first) > max_points:
+        first = rng.choice(first, max_points, replace=False)
+    return xyz[np.sort(first)]

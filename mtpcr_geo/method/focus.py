@@ -12,19 +12,18 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Matches
-from mtpcr_geo.match.base import Advance, Matcher, View
-from mtpcr_geo.method.bev import grid_around, rasterise
+from mtpcr_geo.method.bev import grid_around, make_bev
 from mtpcr_geo.method.overlap import overlap_of
 from mtpcr_geo.method.solve import ransac_upright
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Rematch = Callable[[Bev, Bev, float | None], Matches]
+"""Matches two rasters, source first, at a yaw in radians that is known to some 20 degrees, or None."""
 
 FEWEST = 5
 """Agreeing matches below which the first pass is taken to have found no pose."""
@@ -65,25 +64,21 @@ class Subject:
 
 
 def focus(
-    matcher: Matcher,
+    rematch: Rematch,
     first: Matches,
     source: Subject,
     target: Subject,
-    view: Callable[[Bev], View],
     settings: FocusSettings,
     seed: int = 0,
-    advance: Advance = lambda n: None,
 ) -> Matches:
     """Match again where the overlap is small, and keep what more matches agree on.
 
     Args:
-        matcher: which matched first.
+        rematch: the matcher that matched first.
         first: what it found.
         source, target: both clouds.
-        view: makes what the matcher looks at from a raster.
         settings: see `FocusSettings`.
         seed: of random choices.
-        advance: called with 1 after each orientation tried.
 
     Returns:
         The matches, on the pixels of the rasters given; ``report["focus"]`` says what was done, and
@@ -107,20 +102,20 @@ def focus(
     if not len(first.score):
         return _noted(first, report | {"why": "the first pass matched nothing"})
     near = agreeing if known else np.ones(len(first.score), bool)
-    views = []
+    rasters = []
     for subject, px in ((source, first.source_px), (target, first.target_px)):
         cell = max(subject.grid.cell / settings.finer, min(settings.finest_m, subject.grid.cell))
         points = neighbourhood(subject.xyz, subject.grid.to_metres(px[near]), settings.radius_m)
         if len(points) < FEWEST_POINTS:
             return _noted(first, report | {"why": "there are no points around the matches"})
-        views.append(view(rasterise([points], grid_around(*transforms.bounds(points), cell))))
-    report |= {"cells_m": [v.grid.cell for v in views]}
+        rasters.append(make_bev(points, cell))
+    report |= {"cells_m": [one.grid.cell for one in rasters]}
     yaw = transforms.yaw_of(T[:3, :3]) if known else None
     try:
-        found = matcher.match(views[0], views[1], seed=seed, yaw=yaw, advance=advance)
+        found = rematch(rasters[0], rasters[1], yaw)
     except RegistrationError as error:
         return _noted(first, report | {"why": f"the second pass came to nothing: {error}"})
-    second = _on_grids(found, (views[0].grid, views[1].grid), (source.grid, target.grid))
+    second = _on_grids(found, (rasters[0].grid, rasters[1].grid), (source.grid, target.grid))
     _, after = _consensus(second, source.grid, target.grid, tolerance, seed)
     report |= {"agreeing_after": int(after.sum()), "matches_after": len(second.score)}
     if after.sum() <= agreeing.sum():
@@ -148,13 +143,13 @@ def neighbourhood(xyz: Floats, centres: Floats, radius_m: float) -> Floats:
     low, high = transforms.bounds(xyz[:, :2])
     grid = grid_around(low, high, max(radius_m / 8, 1.0))
     spots = np.full(grid.shape, 255, np.uint8)
-    px = np.round(grid.to_pixel(centres)).astype(int)
-    inside = ((px >= 0) & (px < [grid.width, grid.height])).all(axis=1)
-    spots[px[inside, 1], px[inside, 0]] = 0
+    column, row = grid.cells(centres)
+    inside = grid.holds(column, row)
+    spots[row[inside], column[inside]] = 0
     near = cv2.distanceTransform(spots, cv2.DIST_L2, 5) * grid.cell <= radius_m
-    at = np.round(grid.to_pixel(xyz[:, :2])).astype(int)
-    at = np.clip(at, 0, [grid.width - 1, grid.height - 1])
-    return np.asarray(xyz[near[at[:, 1], at[:, 0]]])
+    column, row = grid.cells(xyz)
+    column, row = np.clip(column, 0, grid.width - 1), np.clip(row, 0, grid.height - 1)
+    return np.asarray(xyz[near[row, column]])
 
 
 def _consensus(

@@ -4,26 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import RegistrationError
+from mtpcr_geo.core.types import IcpMethod, IcpRound
 from mtpcr_geo.method.downsample import near, thinned
 from mtpcr_geo.method.neighbourhoods import local_shapes
 from mtpcr_geo.method.overlap import overlap_of
 
-Floats = NDArray[np.float64]
-Method = Literal["gicp", "point_to_plane", "point_to_point"]
-
 _SMALL_GICP_NAMES = {"gicp": "GICP", "point_to_plane": "PLANE_ICP", "point_to_point": "ICP"}
 FEWEST_POINTS = 200
-FAR_REACH_M = (3.0, 1.5)
-NEAR_REACH_M = (1.0, 0.5)
+FAR_DISTANCES_M = (3.0, 1.5)
+NEAR_DISTANCES_M = (1.0, 0.5)
 FINE_CELL_M = 2.0
-"""Cell of the rasters up to which reaches stand as they are; beyond it they grow in step."""
+"""Cell of the rasters up to which correspondence distances stand as they are; beyond it they grow in step."""
 
 STILL_RAD = 4e-6
 STILL_M = 1e-4
@@ -31,7 +29,7 @@ NEIGHBOURS = 10
 FLAT = 4.0
 """Times that a flat neighbourhood spreads further along its surface than across it."""
 
-JUDGES = 10_000
+PROBES = 10_000
 MEETS_M = 0.1
 """Gap between surfaces at which half the cost is reached that surfaces bear which do not meet at all."""
 
@@ -41,29 +39,29 @@ class Rounds:
     """How a run of ICP goes about it.
 
     Attributes:
-        reach_m: farthest correspondence of each round, metres.
+        max_correspondence_distances_m: farthest correspondence of each round, metres.
         trim_m: distance within which a point of the source must have a partner at the start to take part in
             all rounds but the last, metres; None takes all. What grew or was built in between is left
-            out by it; the last round takes all, so that the result does not hang on the start.
+            out by it; the last round takes all, so that the result does not depend on the start.
 
     """
 
-    reach_m: tuple[float, ...]
+    max_correspondence_distances_m: tuple[float, ...]
     trim_m: float | None = None
 
 
 @dataclass(frozen=True)
 class Descent:
-    """Where one run of ICP came to.
+    """Result of one run of ICP.
 
     Attributes:
         T: 4x4 from source to target, work coordinates.
-        rounds: reach, iterations, inliers and convergence of each round.
+        rounds: distance, iterations, inliers and convergence of each round.
 
     """
 
     T: Floats
-    rounds: list[dict[str, Any]]
+    rounds: tuple[IcpRound, ...]
 
 
 class Surfaces:
@@ -73,7 +71,7 @@ class Surfaces:
         source, target: (n, 3) and (m, 3) work coordinates, metres.
         T_start: 4x4 from source to target, near the result: it tells which points lie in the overlap.
         voxel_m: thinning, metres.
-        reach_m: farthest correspondence to be asked for, metres.
+        max_correspondence_distance_m: farthest correspondence to be asked for, metres.
         most_points: of the source after thinning; the target, which costs less, may have three times as many.
         threads: for thinning and surfaces.
 
@@ -89,7 +87,7 @@ class Surfaces:
         T_start: Floats,
         *,
         voxel_m: float = 0.5,
-        reach_m: float = FAR_REACH_M[0],
+        max_correspondence_distance_m: float = FAR_DISTANCES_M[0],
         max_points: int = 30_000,
         threads: int = 2,
     ) -> None:
@@ -100,7 +98,8 @@ class Surfaces:
         of_source, of_target = (np.flatnonzero(overlap.select(xyz)) for xyz in (moved, target))
         if min(len(of_source), len(of_target)) >= FEWEST_POINTS:
             s, t = moved[of_source], target[of_target]
-            of_source, of_target = of_source[near(s, t, reach_m)], of_target[near(t, s, reach_m)]
+            farthest = max_correspondence_distance_m
+            of_source, of_target = of_source[near(s, t, farthest)], of_target[near(t, s, farthest)]
         if min(len(of_source), len(of_target)) < FEWEST_POINTS:
             raise RegistrationError(
                 f"only {min(len(of_source), len(of_target))} points of one cloud lie in the overlap, "
@@ -124,51 +123,48 @@ class Surfaces:
         return len(self._s), len(self._t)
 
     def descend(
-        self, T_from: Floats, rounds: Rounds, *, method: Method = "gicp", iterations: int = 30
+        self, T_from: Floats, rounds: Rounds, *, method: IcpMethod = "gicp", iterations: int = 30
     ) -> Descent:
-        """Run ICP from a transform, in rounds of given reach.
+        """Run ICP from a transform, in rounds of given correspondence distance.
 
         The optimiser runs on one thread: sums over several would differ in their last bits from run to run.
 
         Args:
             T_from: 4x4 from source to target, work coordinates.
-            rounds: reach of each round, and which points take part.
+            rounds: correspondence distance of each round, and which points take part.
             method: "gicp" (plane to plane), "point_to_plane", or "point_to_point" (the paper's citation).
             iterations: at most, each round.
 
         """
         import small_gicp
 
-        X, reported = self._relative(T_from), []
+        X = self._relative(T_from)
+        done: list[IcpRound] = []
+        distances = rounds.max_correspondence_distances_m
         trimmed = self._source if rounds.trim_m is None else self._trimmed(X, rounds.trim_m)
-        for number, reach in enumerate(rounds.reach_m, 1):
+        for number, distance in enumerate(distances, 1):
             # what a round leaves is taken up by the next; only the last must stand still
-            last = number == len(rounds.reach_m)
-            patience = 1.0 if last else 25.0
+            last = number == len(distances)
+            slack = 1.0 if last else 25.0
             result = small_gicp.align(
                 self._target,
                 self._source if last else trimmed,
                 self._tree,
                 X,
                 registration_type=_SMALL_GICP_NAMES[method],
-                max_correspondence_distance=reach,
+                max_correspondence_distance=distance,
                 num_threads=1,
                 max_iterations=iterations,
-                rotation_epsilon=patience * STILL_RAD,
-                translation_epsilon=patience * STILL_M,
+                rotation_epsilon=slack * STILL_RAD,
+                translation_epsilon=slack * STILL_M,
             )
             X = np.array(result.T_target_source)
-            reported.append(
-                {
-                    "reach_m": reach,
-                    "iterations": int(result.iterations),
-                    "inliers": int(result.num_inliers),
-                    "converged": bool(result.converged),
-                }
+            done.append(
+                IcpRound(distance, int(result.iterations), int(result.num_inliers), bool(result.converged))
             )
         X[:3, :3] = transforms.orthonormal(X[:3, :3])
         T = transforms.translation(self._pivot) @ X @ transforms.translation(-self._pivot) @ self.T_start
-        return Descent(T, reported)
+        return Descent(T, tuple(done))
 
     def surface_residual(self, T: Floats) -> float:
         """Return how badly flat surfaces of the source meet the target: 0 all meet, 1 none does.
@@ -181,11 +177,11 @@ class Surfaces:
             T: 4x4 from source to target, work coordinates.
 
         """
-        judges, normals = self._judges
-        if not len(judges):
+        probes, normals = self._probes
+        if not len(probes):
             return 1.0
         X = self._relative(T)
-        moved, normal = transforms.apply(X, judges), normals @ X[:3, :3].T
+        moved, normal = transforms.apply(X, probes), normals @ X[:3, :3].T
         nearest = np.asarray(self._tree.batch_knn_search(moved, 1, self._threads)[0])[:, 0].astype(np.int64)
         gap = np.einsum("ij,ij->i", normal, self._t[nearest] - moved)
         return float((gap**2 / (gap**2 + MEETS_M**2)).mean())
@@ -211,9 +207,9 @@ class Surfaces:
         return cloud
 
     @cached_property
-    def _judges(self) -> tuple[Floats, Floats]:
+    def _probes(self) -> tuple[Floats, Floats]:
         """Flat places of the source, (n, 3), and their unit normals, (n, 3)."""
-        chosen = np.arange(0, len(self._s), max(len(self._s) // JUDGES, 1))
+        chosen = np.arange(0, len(self._s), max(len(self._s) // PROBES, 1))
         spread, axes = local_shapes(self._source_tree, self._s, self._s[chosen], NEIGHBOURS, self._threads)
         flat = spread[:, 1] > FLAT * spread[:, 0]
         return self._s[chosen[flat]], axes[flat, :, 0]
@@ -230,5 +226,7 @@ def rounds_for(cell: float) -> dict[str, Rounds]:
     Those from far catch starts that are off by metres. Both end in the same rounds.
     """
     scale = max(1.0, cell / FINE_CELL_M)
-    far, close = (tuple(scale * reach for reach in reaches) for reaches in (FAR_REACH_M, NEAR_REACH_M))
+    far, close = (
+        tuple(scale * distance for distance in distances) for distances in (FAR_DISTANCES_M, NEAR_DISTANCES_M)
+    )
     return {"far": Rounds((*far, *close)), "near": Rounds((*close, close[-1]), trim_m=close[0])}

@@ -1,4 +1,4 @@
-"""What a matcher sees: images made from a height raster.
+"""Images of a height raster: grey values (Eq. 3), enhancement (Eq. 4), band-passed heights, step edges.
 
 The band-passed height shows roofs, crowns and kerbs alike whatever the terrain beneath; the step edges
 show facades and eaves, which are all that a street-level scan shares with a view from above.
@@ -8,17 +8,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import get_args
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Grey, Image
 from mtpcr_geo.core.types import Bev, Look
-from mtpcr_geo.method import paper
 
-Image = NDArray[np.float32]
-Grey = NDArray[np.uint8]
+Gain = Literal["saturated", "normalised"]
 LOOKS: tuple[Look, ...] = get_args(Look)
 
 EMPTY_GREY = 127
@@ -30,6 +28,63 @@ HEIGHT_CLIP_M = 8.0
 STEP_FLOOR_M = 1.0
 STEP_RANGE_M = 5.0
 _TINY_WEIGHT = 1e-3
+
+W1 = np.full((3, 3), -2.0, np.float32)
+W1[1, 1] = 32.0
+"""First high-pass filter of Eq. 4; its sum is 16."""
+
+W2 = np.full((3, 3), -1.0, np.float32)
+W2[1, 1] = 10.0
+"""Second high-pass filter of Eq. 4; its sum is 2."""
+
+
+def grey(bev: Bev, *, printed: bool = False) -> Grey:
+    """Make the grey image (Eq. 3): 0..255 from the lowest to the highest point, 0 where empty.
+
+    Args:
+        bev: the raster; zmin and zmax are those of all its points.
+        printed: take the floor of the fraction alone, as printed, which leaves 0 or 255.
+
+    Returns:
+        (h, w) uint8.
+
+    """
+    filled = bev.count > 0
+    if not filled.any():
+        return np.zeros(bev.grid.shape, np.uint8)
+    low, high = (float(value) for value in height_span(bev))
+    span = max(high - low, 1e-6)
+    fraction = (np.where(filled, bev.top, low).astype(np.float64) - low) / span
+    scaled = np.floor(fraction) * 255 if printed else np.floor(255 * fraction)
+    return np.where(filled, np.clip(scaled, 0, 255), 0).astype(np.uint8)
+
+
+def height_span(bev: Bev) -> tuple[float, float]:
+    """Return zmin and zmax over all points of a raster, metres; NaN where it is empty."""
+    filled = bev.count > 0
+    if not filled.any():
+        return float("nan"), float("nan")
+    return float(bev.low[filled].min()), float(bev.top[filled].max())
+
+
+def enhance(image: Grey, gain: Gain = "saturated") -> Grey:
+    """Sharpen a grey image by both high-pass filters (Eq. 4).
+
+    Args:
+        image: (h, w) uint8.
+        gain: "saturated" cuts to 0..255 after each filter, as image libraries do; the filters multiply
+            the mean by 16 and by 2, so most of the image becomes white. "normalised" divides each by its
+            sum, and cuts once at the end.
+
+    Returns:
+        (h, w) uint8.
+
+    """
+    if gain == "saturated":
+        return np.asarray(cv2.filter2D(cv2.filter2D(image, -1, W1), -1, W2), np.uint8)
+    once = cv2.filter2D(image.astype(np.float32), -1, W1 / W1.sum())
+    twice = cv2.filter2D(once, -1, W2 / W2.sum())
+    return np.asarray(np.clip(np.rint(twice), 0, 255), np.uint8)
 
 
 def masked_blur(image: Image, mask: Image, sigma_cells: float) -> Image:
@@ -141,10 +196,10 @@ def image_of(bev: Bev, look: Look) -> Grey:
     """
     if look == "band_pass":
         return band_image(bev)
-    plain = paper.grey(bev, printed=look == "grey_printed")
+    plain = grey(bev, printed=look == "grey_printed")
     if look in ("grey", "grey_printed"):
         return plain
-    return paper.enhance(plain, "saturated" if look == "paper" else "normalised")
+    return enhance(plain, "saturated" if look == "paper" else "normalised")
 
 
 def empty_grey(look: Look) -> int:

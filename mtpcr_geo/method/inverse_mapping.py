@@ -1,4 +1,4 @@
-"""Inverse mapping (Eq. 5): from matched pixels back to 3D, with heights from the float rasters."""
+"""Inverse mapping (Eq. 5): from matched pixels back to 3D tie points, with heights from the float rasters."""
 
 from __future__ import annotations
 
@@ -7,17 +7,53 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.types import Bev, Matches, TiePoints
-from mtpcr_geo.method.paper import height_span
+from mtpcr_geo.method.images import height_span
 
-Floats = NDArray[np.float64]
 Surface = Literal["ground", "top", "grey"]
-Pixel = Literal["centre", "ceil"]
+Pixel = Literal["centre", "ceil", "printed"]
 
 GROUND_RADIUS_M = 4.0
 
 
-def inverse_mapping(
+def inverse_mapping(px: Floats, bev: Bev, *, surface: Surface = "ground", pixel: Pixel = "centre") -> Floats:
+    """Take pixels of a raster back to 3D (Eq. 5).
+
+    Args:
+        px: (n, 2) pixel coordinates (column, row), pixel centres at integers.
+        bev: the raster, in levelled coordinates.
+        surface: "ground" takes the lowest z around the pixel, which both clouds see under canopy and
+            eaves; "top" takes the highest z of the cell; "grey" has it in 255 steps, as in the paper.
+        pixel: "centre" puts a pixel at the centre of its cell; "ceil" at the north-east corner, which is
+            Eq. 5 without the misprint (Y from j); "printed" takes Y from i, as printed, so that all points
+            fall on one line. Both suit rasters of the ceiling convention (Eq. 2 as printed).
+
+    Returns:
+        (n, 3) metres in the raster's frame; z is NaN where the raster is empty or the pixel lies outside.
+
+    """
+    grid = bev.grid
+    px = np.asarray(px, np.float64)
+    xy = grid.to_metres(px)
+    if pixel != "centre":
+        xy = xy + grid.cell / 2
+    if pixel == "printed":
+        # i and j count from the south-west cell, which holds the lowest x and y alone
+        south_west = grid.to_metres(np.array([[0.0, grid.height - 1.0]]))[0] + grid.cell / 2
+        xy[:, 1] = south_west[1] + (xy[:, 0] - south_west[0])
+    column, row = (np.round(px[:, axis]).astype(np.int64) for axis in (0, 1))
+    inside = grid.holds(column, row)
+    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+    z = (_lowest_around(bev) if surface == "ground" else bev.top)[row, column].astype(np.float64)
+    if surface == "grey":
+        low, high = height_span(bev)
+        step = max(high - low, 1e-6) / 255
+        z = low + step * np.floor((z - low) / step)
+    return np.column_stack([xy, np.where(inside, z, np.nan)])
+
+
+def tie_points_of(
     matches: Matches,
     source: Bev,
     target: Bev,
@@ -28,47 +64,27 @@ def inverse_mapping(
     block_m: float = 40.0,
     seed: int = 0,
 ) -> TiePoints:
-    """Lift matches to tie points in levelled coordinates, and set some aside to judge the result by.
+    """Map matches back to 3D (Eq. 5), and set some aside to judge the result by.
 
     The tie points of whole square blocks of the target go into one fold, so that tie points held out are
-    no neighbours of
-    those the transform is solved from. Tie points without a height on either side are left out.
+    no neighbours of those the transform is solved from. Those without a height on either side are left out.
 
     Args:
         matches: pixel pairs.
         source: raster of the cloud that moves.
         target: raster of the cloud that stays.
-        surface: "ground" takes the lowest z around the pixel, which both clouds see under canopy and
-            eaves; "top" takes the highest z of the cell; "grey" has it in 255 steps, as in the paper.
-        pixel: "centre" puts a pixel at the centre of its cell; "ceil" at the north-east corner (Eq. 5).
+        surface, pixel: see `inverse_mapping`.
         folds: parts into which the blocks are dealt; the first is held out from the solve.
         block_m: edge of a block, metres.
         seed: chooses the blocks.
 
     """
-    s = pixels_to_3d(matches.source_px, source, surface, pixel)
-    t = pixels_to_3d(matches.target_px, target, surface, pixel)
+    s = inverse_mapping(matches.source_px, source, surface=surface, pixel=pixel)
+    t = inverse_mapping(matches.target_px, target, surface=surface, pixel=pixel)
     known = np.isfinite(s[:, 2]) & np.isfinite(t[:, 2])
     s, t, score = s[known], t[known], matches.score[known]
     fold = folds_of(t[:, :2], folds, block_m, seed)
     return TiePoints(s, t, score, fold, fold == 0, np.ones(len(s), bool))
-
-
-def pixels_to_3d(px: Floats, bev: Bev, surface: Surface, pixel: Pixel = "centre") -> Floats:
-    """Return (n, 3) metres of (n, 2) pixels, see `lift`; z is NaN where the raster is empty."""
-    xy = bev.grid.to_metres(px)
-    if pixel == "ceil":
-        xy = xy + bev.grid.cell / 2
-    column = np.round(px[:, 0]).astype(int)
-    row = np.round(px[:, 1]).astype(int)
-    inside = (column >= 0) & (column < bev.grid.width) & (row >= 0) & (row < bev.grid.height)
-    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
-    z = (_lowest_around(bev) if surface == "ground" else bev.top)[row, column].astype(np.float64)
-    if surface == "grey":
-        low, high = height_span(bev)
-        step = max(high - low, 1e-6) / 255
-        z = low + step * np.floor((z - low) / step)
-    return np.column_stack([xy, np.where(inside, z, np.nan)])
 
 
 def _lowest_around(bev: Bev) -> NDArray[np.float32]:
@@ -82,9 +98,19 @@ def _lowest_around(bev: Bev) -> NDArray[np.float32]:
 
 
 def folds_of(xy: Floats, folds: int, block_m: float, seed: int) -> NDArray[np.int64]:
-    """Deal (n, 2) points into folds, whole square blocks at a time and evenly: (n,) numbers 0..folds-1.
+    """Deal points into folds, whole square blocks at a time and evenly.
 
-    The blocks hang on the points' own corner, so a shift of the scene changes nothing.
+    The blocks start at the points' own corner, so a shift of the scene changes nothing.
+
+    Args:
+        xy: (n, 2) metres.
+        folds: number of folds.
+        block_m: edge of a block, metres.
+        seed: chooses which block goes into which fold.
+
+    Returns:
+        (n,) numbers 0..folds-1.
+
     """
     if len(xy) == 0:
         return np.zeros(0, np.int64)

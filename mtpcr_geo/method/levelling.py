@@ -7,16 +7,17 @@ seen, they decide and the plane only tells roughly where up is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.types import Levelling
+from mtpcr_geo.method.downsample import one_per_voxel
 from mtpcr_geo.method.neighbourhoods import local_shapes
 
-Floats = NDArray[np.float64]
 Mode = Literal["auto", "ransac", "none"]
 
 MAX_TILT_DEG = 25.0
@@ -33,22 +34,6 @@ WORST_CONDITION = 0.04
 """Share of the vertical evidence that must speak for the less well seen of the two tilt directions."""
 
 
-@dataclass(frozen=True)
-class Levelling:
-    """How a cloud was made upright.
-
-    Attributes:
-        T_level_work: 4x4 rotation about the sample's centre.
-        method: "none", "plane" (paper) or "verticals".
-        report: tilt and evidence, for the audit.
-
-    """
-
-    T_level_work: Floats
-    method: Literal["none", "plane", "verticals"]
-    report: dict[str, Any]
-
-
 def level(xyz: Floats, mode: Mode, georeferenced: bool, seed: int = 0) -> Levelling:
     """Find the rotation that makes a cloud upright.
 
@@ -62,42 +47,23 @@ def level(xyz: Floats, mode: Mode, georeferenced: bool, seed: int = 0) -> Levell
 
     """
     if mode == "none" or (mode == "auto" and georeferenced):
-        why = "kept as it is" if mode == "none" else "the CRS defines the vertical"
-        return Levelling(np.eye(4), "none", {"method": "none", "why": why, "tilt_deg": 0.0})
+        return Levelling(why="kept as it is" if mode == "none" else "the CRS defines the vertical")
     rng = np.random.default_rng(seed)
     centre = xyz.mean(axis=0)
-    thinned = thin(xyz - centre, 1.0, rng, 30_000)
-    up, share = ground_plane(thinned, rng)
-    report: dict[str, Any] = {
-        "method": "plane",
-        "plane_tilt_deg": _tilt_deg(up),
-        "plane_inlier_share": share,
-    }
-    method: Literal["plane", "verticals"] = "plane"
+    up, share = ground_plane(one_per_voxel(xyz - centre, 1.0, rng, 30_000), rng)
+    found = Levelling(method="plane", plane_tilt_deg=_tilt_deg(up), plane_inlier_share=share)
     if mode == "auto":
-        plumb = plumb_line(thin(xyz - centre, 0.4, rng, 200_000), up, rng)
-        report |= {"verticals": plumb.count, "verticals_spread_deg": plumb.spread_deg}
+        plumb = plumb_line(one_per_voxel(xyz - centre, 0.4, rng, 200_000), up, rng)
+        found = replace(found, verticals=plumb.count, verticals_spread_deg=plumb.spread_deg)
         if plumb.up is not None:
-            report |= {"method": "verticals", "plane_to_verticals_deg": _between_deg(up, plumb.up)}
-            up, method = plumb.up, "verticals"
+            apart = _between_deg(up, plumb.up)
+            found = replace(found, method="verticals", plane_to_verticals_deg=apart)
+            up = plumb.up
         elif share < FEWEST_ON_PLANE:
             why = "too little vertical structure, and no ground plane that holds"
-            return Levelling(np.eye(4), "none", report | {"method": "none", "why": why, "tilt_deg": 0.0})
-    report["tilt_deg"] = _tilt_deg(up)
-    return Levelling(transforms.about(centre, rotation_to_up(up)), method, report)
-
-
-def thin(xyz: Floats, edge: float, rng: np.random.Generator, most: int) -> Floats:
-    """Keep one point a cube of ``edge`` metres, and a random ``most`` of those."""
-    if len(xyz) > 1_500_000:
-        xyz = xyz[rng.choice(len(xyz), 1_500_000, replace=False)]
-    low, high = transforms.bounds(xyz)
-    cube = np.floor((xyz - low) / edge).astype(np.int64)
-    span = np.floor((high - low) / edge).astype(np.int64) + 1
-    _, first = np.unique((cube[:, 0] * span[1] + cube[:, 1]) * span[2] + cube[:, 2], return_index=True)
-    if len(first) > most:
-        first = rng.choice(first, most, replace=False)
-    return xyz[np.sort(first)]
+            return replace(found, method="none", why=why)
+    T = transforms.about(centre, rotation_to_up(up))
+    return replace(found, T_level_work=T, tilt_deg=_tilt_deg(up))
 
 
 def ground_plane(xyz: Floats, rng: np.random.Generator, iterations: int = 1500) -> tuple[Floats, float]:
@@ -163,7 +129,7 @@ def plumb_line(xyz: Floats, about: Floats, rng: np.random.Generator) -> PlumbLin
 
     Args:
         xyz: (n, 3) points thinned to about 0.4 m, metres.
-        about: (3,) rough up; only structure within 20 degrees of plumb by it is heard.
+        about: (3,) rough up; only structure within 20 degrees of plumb by it is used.
         rng: chooses the points whose neighbourhoods are looked at.
 
     """

@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev
 from mtpcr_geo.method.bev import grid_around, rasterise
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 OVERLAP_CELL_M = 2.0
 
@@ -47,10 +45,10 @@ class Overlap:
 
     def select(self, xyz: Floats) -> Mask:
         """Return which (n, 3) points lie in the overlap."""
-        pixel = np.round(self.grid.to_pixel(xyz[:, :2])).astype(int)
-        inside = ((pixel >= 0) & (pixel < [self.grid.width, self.grid.height])).all(axis=1)
+        column, row = self.grid.cells(xyz)
+        inside = self.grid.holds(column, row)
         found = np.zeros(len(xyz), bool)
-        found[inside] = self.shared[pixel[inside, 1], pixel[inside, 0]]
+        found[inside] = self.shared[row[inside], column[inside]]
         return found
 
     def ground_steps(self) -> tuple[Floats, Floats]:

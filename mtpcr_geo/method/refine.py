@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.method.icp import Descent, Method, Rounds, Surfaces
+from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.types import GroundFit, IcpMethod, IcpResult, IcpTrial, Refinement
+from mtpcr_geo.method.icp import Rounds, Surfaces, rounds_for
 from mtpcr_geo.method.overlap import Overlap, overlap_of
 
-Floats = NDArray[np.float64]
 Motion = Literal["rigid", "yaw", "translation"]
 
 FEWEST_GROUND_CELLS = 30
@@ -27,17 +27,96 @@ they are equal but for chance, and results would jump with it."""
 
 
 @dataclass(frozen=True)
-class Refinement:
-    """Result of the refinement.
+class RefineSettings:
+    """How a transform is refined.
 
     Attributes:
-        T: 4x4 from source to target, work coordinates.
-        report: what was done, for the audit.
+        method: ICP variant; None leaves ICP out.
+        voxel_m: thinning of the points, metres.
+        max_correspondence_distances_m: farthest correspondence of each round, metres; if None, far and near
+            rounds are tried, and what the surfaces fit best is taken.
+        max_points: points of the source after thinning; the target may have three times as many.
+        iterations: iterations of each round at most.
+        motion: degrees of freedom of the result: all six, yaw and shift, or the shift alone.
+        ground: settle height and tilt on the ground before ICP, and the height after it.
+        keep_tie_points: share of the agreeing tie points that must still agree after ICP for it to be
+            followed; 0 to follow it always.
 
     """
 
-    T: Floats
-    report: dict[str, Any] = field(default_factory=dict)
+    method: IcpMethod | None = "gicp"
+    voxel_m: float = 0.5
+    max_correspondence_distances_m: tuple[float, ...] | None = None
+    max_points: int = 30_000
+    iterations: int = 30
+    motion: Motion = "rigid"
+    ground: bool = True
+    keep_tie_points: float = 0.5
+
+
+def refine(
+    source: Floats,
+    target: Floats,
+    T_start: Floats,
+    settings: RefineSettings = RefineSettings(),
+    *,
+    cell: float = 1.0,
+    agreeing: Callable[[Floats], int] = lambda T: 0,
+    pivot: Floats | None = None,
+    R_upright: Floats | None = None,
+) -> Refinement:
+    """Refine a transform by ICP on the overlap, with the height settled on the ground.
+
+    Args:
+        source, target: (n, 3) and (m, 3) work coordinates, metres.
+        T_start: 4x4 from source to target, a metre or two from the truth.
+        settings: how to refine.
+        cell: of the rasters the start was found on, metres: how exact it may be.
+        agreeing: counts the tie points that a transform brings together.
+        pivot: (3,) middle of the overlap, source coordinates, where fewer degrees of freedom are wanted;
+            the source's centroid if None.
+        R_upright: (3, 3) rotation that both levellings make; none if None.
+
+    Raises:
+        RegistrationError: if the clouds hardly overlap under the start.
+
+    """
+    T, ground_before, icp, ground_after = T_start, None, None, None
+    starts = {"tie_points": T}
+    if settings.ground:
+        ground_before = settle_on_ground(source, target, T, tilt=True)
+        T = starts["ground"] = ground_before.T
+    if settings.method is not None:
+        asked = settings.max_correspondence_distances_m
+        rounds = {"asked": Rounds(tuple(asked))} if asked else rounds_for(cell)
+        surfaces = Surfaces(
+            source,
+            target,
+            T,
+            voxel_m=settings.voxel_m,
+            max_correspondence_distance_m=max(
+                max(one.max_correspondence_distances_m) for one in rounds.values()
+            ),
+            max_points=settings.max_points,
+        )
+        icp = follow_icp(
+            surfaces,
+            starts,
+            rounds=rounds,
+            agreeing=agreeing,
+            keep_tie_points=settings.keep_tie_points,
+            method=settings.method,
+            iterations=settings.iterations,
+        )
+        T = icp.T
+    if settings.ground:
+        ground_after = settle_on_ground(source, target, T, tilt=False)
+        ground_after = replace(ground_after, followed=settings.method is None or beyond_scatter(ground_after))
+        T = ground_after.T if ground_after.followed else T
+    if settings.motion != "rigid":
+        middle = source.mean(axis=0) if pivot is None else pivot
+        T = constrain(T, settings.motion, middle, np.eye(3) if R_upright is None else R_upright)
+    return Refinement(T, T_start, ground_before, icp, ground_after)
 
 
 def follow_icp(
@@ -47,16 +126,15 @@ def follow_icp(
     rounds: dict[str, Rounds],
     agreeing: Callable[[Floats], int],
     keep_tie_points: float,
-    method: Method = "gicp",
+    method: IcpMethod = "gicp",
     iterations: int = 30,
-) -> Refinement:
-    """Run ICP with several reaches, and take what the surfaces fit best, the starts themselves among it.
+) -> IcpResult:
+    """Run ICP with several correspondence distances and take what the surfaces fit best, starts included.
 
-    A far reach catches starts that are off by metres, but on open ground it lets the clouds slide; a near
+    A far one catches starts that are off by metres, but on open ground it lets the clouds slide; a near
     one does not. Neither is right where crops or bushes grew between the surveys and hold the least squares
-    off the ground, which `Surfaces.residual` sees through. In plan only the tie points have seen anything
-    on open
-    ground, so what loses them is not followed.
+    off the ground, which `Surfaces.surface_residual` sees through. In plan only the tie points have seen
+    anything on open ground, so what loses them is not followed.
 
     Args:
         surfaces: of both clouds.
@@ -78,39 +156,37 @@ def follow_icp(
         name: run.T for name, run in runs.items()
     }
     wanted = keep_tie_points * agreeing(starts[last])
-    surface_residual = {name: surfaces.surface_residual(T) for name, T in tried.items()}
-    tie_points = {name: agreeing(T) for name, T in tried.items()}
-    kept = [name for name in tried if name == last or tie_points[name] >= wanted]
-    best = min(kept, key=lambda name: surface_residual[name] * (1.0 if name in runs else CLEARLY))
-    lost = [name for name in runs if name not in kept and surface_residual[name] < surface_residual[best]]
-    report = {
-        "method": method,
-        "voxel_m": surfaces.voxel_m,
-        "points_source": surfaces.sizes[0],
-        "points_target": surfaces.sizes[1],
-        "tried": {
-            name: {"surface_residual": surface_residual[name], "tie_points": tie_points[name]}
-            for name in tried
-        },
-        "chosen": best,
-        "followed": best in runs,
-        "lost_tie_points": bool(lost),
-        **_moved(runs, best, starts[last]),
-    }
-    return Refinement(tried[best], report)
-
-
-def _moved(runs: dict[str, Descent], best: str, T_start: Floats) -> dict[str, Any]:
-    """Return what the run that was followed did; nothing if none was."""
-    if best not in runs:
-        return {}
-    turn = runs[best].T[:3, :3] @ T_start[:3, :3].T
-    return {"rounds": runs[best].rounds, "turned_deg": float(np.degrees(transforms.rotation_angle(turn)))}
+    trials = {name: IcpTrial(surfaces.surface_residual(T), agreeing(T)) for name, T in tried.items()}
+    kept = [name for name in tried if name == last or trials[name].tie_points >= wanted]
+    best = min(kept, key=lambda name: trials[name].surface_residual * (1.0 if name in runs else CLEARLY))
+    lost = [
+        name
+        for name in runs
+        if name not in kept and trials[name].surface_residual < trials[best].surface_residual
+    ]
+    run = runs.get(best)
+    rotated = None
+    if run is not None:
+        rotation = run.T[:3, :3] @ starts[last][:3, :3].T
+        rotated = float(np.degrees(transforms.rotation_angle(rotation)))
+    return IcpResult(
+        T=tried[best],
+        method=method,
+        voxel_m=surfaces.voxel_m,
+        points_source=surfaces.sizes[0],
+        points_target=surfaces.sizes[1],
+        tried=trials,
+        chosen=best,
+        followed=run is not None,
+        lost_tie_points=bool(lost),
+        rounds=run.rounds if run is not None else (),
+        rotated_deg=rotated,
+    )
 
 
 def settle_on_ground(
     source: Floats, target: Floats, T_start: Floats, *, tilt: bool, overlap: Overlap | None = None
-) -> Refinement:
+) -> GroundFit:
     """Correct the height, and if wanted the tilt, so that both clouds' ground agrees.
 
     Canopy and facades bias the height of a fit to everything; the lowest surface does not. A plane is
@@ -127,7 +203,7 @@ def settle_on_ground(
         overlap = overlap_of(transforms.apply(T_start, source), target)
     xy, step = overlap.ground_steps()
     if len(step) < FEWEST_GROUND_CELLS:
-        return Refinement(T_start, {"ground_cells": len(step)})
+        return GroundFit(T_start, len(step))
     centre = xy.mean(axis=0)
     offset = xy - centre
     A = np.column_stack([np.ones(len(step)), offset]) if tilt else np.ones((len(step), 1))
@@ -152,26 +228,25 @@ def settle_on_ground(
         # raising the ground towards +x means turning about -y, and towards +y about +x
         R = transforms.axis_angle_matrix(np.array([x[2], -x[1], 0.0]) / slope, float(np.arctan(slope)))
     T = transforms.translation((0.0, 0.0, float(x[0]))) @ transforms.about(pivot, R) @ T_start
-    report = {
-        "ground_cells": len(step),
-        "ground_cells_agreeing": int(close.sum()),
-        "rise_m": float(x[0]),
-        "ground_spread_m": spread,
-        "tilt_deg": float(np.degrees(transforms.rotation_angle(R))),
-    }
-    return Refinement(T, report)
+    return GroundFit(
+        T,
+        cells=len(step),
+        agreeing=int(close.sum()),
+        rise_m=float(x[0]),
+        spread_m=spread,
+        tilt_deg=float(np.degrees(transforms.rotation_angle(R))),
+    )
 
 
-def beyond_scatter(settled: Refinement) -> bool:
-    """Return whether the ground's rise is more than where the borders of its cells run can make of it.
+def beyond_scatter(settled: GroundFit) -> bool:
+    """Return whether the ground's rise is more than what the borders of its cells can cause.
 
     The lowest of a cell lies the lower the denser the cloud and the steeper the ground, by a part of the
     cells' own scatter. A fit to all points knows the height better than that.
     """
-    report = settled.report
-    if "rise_m" not in report:
+    if settled.rise_m is None or settled.spread_m is None:
         return False
-    return bool(abs(report["rise_m"]) > min(SCATTER_SHARE * report["ground_spread_m"], SCATTER_M))
+    return bool(abs(settled.rise_m) > min(SCATTER_SHARE * settled.spread_m, SCATTER_M))
 
 
 def constrain(T: Floats, motion: Motion, pivot: Floats, R_upright: Floats) -> Floats:

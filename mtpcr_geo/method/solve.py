@@ -6,16 +6,17 @@ a shift remain, two tie points determine them, and RANSAC over pairs of tie poin
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.errors import RegistrationError
+from mtpcr_geo.core.types import Solution, SolveSettings, TiePoints
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+DEFAULTS = SolveSettings()
 
 
 def fit_rigid(source: Floats, target: Floats, weight: Floats | None = None) -> Floats:
@@ -128,24 +129,6 @@ def _planar(xy: Floats) -> Floats:
     return np.column_stack([xy, np.zeros(len(xy))])
 
 
-@dataclass(frozen=True)
-class Solution:
-    """Result of the iterative SVD.
-
-    Attributes:
-        T: 4x4 from source to target.
-        inlier: (n,) tie points within the final threshold.
-        iterations: rounds until nothing changed.
-        threshold: final residual threshold, metres.
-
-    """
-
-    T: Floats
-    inlier: Mask
-    iterations: int
-    threshold: float
-
-
 def iterative_svd(
     source: Floats,
     target: Floats,
@@ -191,40 +174,29 @@ def iterative_svd(
 
 
 def solve_tie_points(
-    source: Floats,
-    target: Floats,
-    score: Floats,
-    held_out: Mask,
-    *,
+    tie_points: TiePoints,
     tolerance: float,
-    robust_start: bool = True,
-    upright: bool = True,
-    tries: int = 2000,
-    seed: int = 0,
+    settings: SolveSettings = DEFAULTS,
+    held_out: Mask | None = None,
 ) -> tuple[Solution, Mask]:
     """Solve the transform from the tie points not held out: robust start, then iterative SVD.
 
     Args:
-        source, target: (n, 3) levelled tie points, metres.
-        score: (n,) weights of the tie points, squared in the fit.
-        held_out: (n,) tie points to leave out.
+        tie_points: in levelled coordinates, metres; their scores squared are the weights of the fit.
         tolerance: plan residual up to which a tie point may agree with a pose, metres; about 1.5 cells.
-        robust_start: begin from the yaw and shift that RANSAC finds; else from all tie points, as in the
-            paper.
-        upright: solve yaw and shift, trusting the levelling; else all six degrees of freedom.
-        tries: pairs of tie points that RANSAC tries.
-        seed: of RANSAC.
+        settings: how to solve.
+        held_out: (n,) tie points to leave out; those that `tie_points` holds out if None.
 
     Returns:
         The solution, whose inlier mask covers the used tie points only, and the (n,) mask of all tie
-        points within
-        the final threshold in plan, held out ones included.
+        points within the final threshold in plan, held out ones included.
 
     Raises:
         RegistrationError: if fewer tie points agree than a transform needs.
 
     """
-    used = np.flatnonzero(~held_out)
+    source, target = tie_points.source, tie_points.target
+    used = np.flatnonzero(~(tie_points.held_out if held_out is None else held_out))
     least = 3
     if len(used) < least:
         raise RegistrationError(
@@ -233,17 +205,17 @@ def solve_tie_points(
         )
     s, t = source[used], target[used]
     start = None
-    if robust_start:
-        _, start = ransac_upright(s, t, tolerance, seed, tries)
+    if settings.robust_start:
+        _, start = ransac_upright(s, t, tolerance, settings.seed, settings.tries)
         if start.sum() < least:
             raise RegistrationError(
                 f"of {len(used)} tie points no {least} agree on one yaw and shift; the clouds may not overlap"
             )
     # the start says to what distance tie points agree; as in the paper there is no such bound
-    ceiling = 2.0 * tolerance if robust_start else np.inf
-    weight = np.maximum(score[used], 0.05) ** 2
+    ceiling = 2.0 * tolerance if settings.robust_start else np.inf
+    weight = np.maximum(tie_points.score[used], 0.05) ** 2
     flat = np.array([1.0, 1.0, 0.0])
-    if upright:
+    if settings.upright:
         # heights of single tie points are rough, so they have no say in plan and are settled by their median
         solution = iterative_svd(
             s * flat, t * flat, start=start, weight=weight, floor=tolerance, ceiling=ceiling, upright=True
@@ -255,4 +227,5 @@ def solve_tie_points(
     else:
         solution = iterative_svd(s, t, start=start, weight=weight, floor=tolerance, ceiling=ceiling)
     plan = np.hypot(*(transforms.apply(solution.T, source) - target)[:, :2].T)
-    return solution, plan < max(tolerance, solution.threshold)
+    inlier = plan < max(tolerance, solution.threshold)
+    return replace(solution, settings=settings, used=len(used)), inlier

@@ -104,7 +104,7 @@ def _paper_method(options: MethodOptions, seed: dict[str, int]) -> list[dict[str
             "tag": "refine",
             "method": "point_to_point",
             "ground": False,
-            "reach": [3.0, 1.5, 0.75],
+            "max_correspondence_distance": [3.0, 1.5, 0.75],
             "keep_tie_points": 0,
         },
         {"type": "mtpcr.assess", "tag": "assess"},

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.statistics import chance_within
-from mtpcr_geo.core.types import Floats, Pair, TiePoints
+from mtpcr_geo.core.types import Pair, SolveSettings, TiePoints
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.method.overlap import overlap_of
 from mtpcr_geo.method.solve import solve_tie_points
@@ -19,6 +21,25 @@ GROUND_AGREES_M = 0.5
 UNBOUNDED_CELLS = 2.0
 TIE_POINTS_PER_PATCH = 4
 """Patches overlap by half, so about four tie points tell what one independent tie would."""
+
+
+@dataclass(frozen=True)
+class PriorComparison:
+    """How many tie points and how many cells of ground agree with what was found, and with the prior.
+
+    Attributes:
+        found: of the transform found.
+        prior: of the one known beforehand.
+
+    """
+
+    found: tuple[int, int]
+    prior: tuple[int, int]
+
+    @property
+    def keep_prior(self) -> bool:
+        """Whether at least as many of both agree with the prior."""
+        return self.prior[0] >= self.found[0] and self.prior[1] >= self.found[1]
 
 
 def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[str, Any]]:
@@ -37,32 +58,36 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
     assert pair.T_target_source is not None
     assert pair.tie_points is not None
     cell = pair.cell
-    matched = pair.matches.report if pair.matches is not None else {}
-    tolerance = tolerance or max(cell, 1.0) * (1.0 if "reach_m" in matched else UNBOUNDED_CELLS)
+    matches = pair.matches
+    radius = matches.search_radius_m if matches is not None else None
+    tolerance = tolerance or max(cell, 1.0) * (1.0 if radius is not None else UNBOUNDED_CELLS)
     T = pair.T_target_source
     tie_points = pair.tie_points
-    T_level = pair.target.T_level_work @ T @ transforms.inverse(pair.source.T_level_work)
+    T_level = pair.levelled(T)
     residual = np.hypot(*(transforms.apply(T_level, tie_points.source) - tie_points.target)[:, :2].T)
-    held_out = cross_validated(tie_points, tolerance, pair.solve_report)
+    held_out = cross_validated(
+        tie_points, tolerance, pair.solution.settings if pair.solution else SolveSettings()
+    )
     agreeing = held_out < tolerance
     moved = transforms.apply(T, pair.source.sample)
     overlap = overlap_of(moved, pair.target.sample)
     _, steps = overlap.ground_steps()
+    icp = pair.refinement.icp if pair.refinement is not None else None
     evidence = Evidence(
         held_out=len(held_out),
         held_out_agreeing=int(agreeing.sum()),
-        chance=chance_within(tolerance, matched["reach_m"]) if "reach_m" in matched else None,
+        chance=None if radius is None else chance_within(tolerance, radius),
         tolerance_m=tolerance,
         held_out_median_m=float(np.median(held_out[agreeing])) if agreeing.any() else None,
-        margin=matched.get("margin"),
-        support=matched.get("support"),
+        margin=matches.margin if matches is not None else None,
+        support=matches.support if matches is not None else None,
         overlap_m2=overlap.area_m2,
         overlap_source=float(overlap.select(moved).mean()),
         overlap_target=float(overlap.select(pair.target.sample).mean()),
         ground_cells=len(steps),
         ground_agreeing=int((np.abs(steps) < GROUND_AGREES_M).sum()),
         refined_away_m=_refined_away(pair, T),
-        refinement_lost=pair.refine_report.get("icp", {}).get("lost_tie_points", False),
+        refinement_lost=icp is not None and icp.lost_tie_points,
         final_agreeing=int((residual < tolerance).sum()),
     )
     shift = T[:3, 3]
@@ -101,40 +126,51 @@ def tie_points_agreeing(pair: Pair, T: Floats, tolerance: float | None = None) -
     """Count the tie points that a transform brings together in plan; arguments as for `agreement`."""
     if pair.tie_points is None:
         return 0
-    T_level = pair.target.T_level_work @ T @ transforms.inverse(pair.source.T_level_work)
+    T_level = pair.levelled(T)
     gap = transforms.apply(T_level, pair.tie_points.source) - pair.tie_points.target
     return int((np.hypot(gap[:, 0], gap[:, 1]) < (tolerance or max(pair.cell, 1.0))).sum())
 
 
-def cross_validated(tie_points: TiePoints, tolerance: float, solved: dict[str, Any]) -> Floats:
+def cross_validated(tie_points: TiePoints, tolerance: float, settings: SolveSettings) -> Floats:
     """Hold out each fold in turn, solve from the others, and return each tie point's plan residual.
 
     Args:
-        tie_points: tie points with folds.
-        tolerance: as given to the solver, metres.
-        solved: the solver's report, for the settings it ran with.
+        tie_points: with folds.
+        tolerance: plan distance within which a tie point agrees, metres.
+        settings: as the solver had them.
 
     Returns:
         (n,) metres; infinite where the others gave no transform.
 
     """
-    residual = np.full(len(tie_points.score), np.inf)
+    residual = np.full(len(tie_points), np.inf)
     for fold in np.unique(tie_points.fold):
         out = tie_points.fold == fold
         try:
-            solution, _ = solve_tie_points(
-                tie_points.source,
-                tie_points.target,
-                tie_points.score,
-                out,
-                tolerance=1.5 * tolerance,
-                **solved.get("settings", {}),
-            )
+            solution, _ = solve_tie_points(tie_points, 1.5 * tolerance, settings, held_out=out)
         except RegistrationError:
             continue
         gap = transforms.apply(solution.T, tie_points.source[out]) - tie_points.target[out]
         residual[out] = np.hypot(gap[:, 0], gap[:, 1])
     return residual
+
+
+def prior_or_found(pair: Pair, tolerance: float | None = None) -> PriorComparison:
+    """Compare what was found with the transform known beforehand, by how much agrees with each.
+
+    Args:
+        pair: solved, with a prior, rasters and tie points.
+        tolerance: plan distance within which a tie point agrees, metres; one cell if None.
+
+    Raises:
+        ValueError: if the pair has no prior or no transform.
+
+    """
+    if pair.T_prior is None or pair.T_target_source is None:
+        raise ValueError("a comparison needs a prior and a transform")
+    return PriorComparison(
+        found=agreement(pair, pair.T_target_source, tolerance), prior=agreement(pair, pair.T_prior, tolerance)
+    )
 
 
 def _refined_away(pair: Pair, T: Floats) -> float:
@@ -144,7 +180,7 @@ def _refined_away(pair: Pair, T: Floats) -> float:
         degree
     of tilt raises by metres. That of the result is judged by the ground.
     """
-    before = pair.refine_report.get("T_before")
+    before = pair.refinement.T_before if pair.refinement is not None else None
     if before is None or pair.tie_points is None or not len(pair.tie_points.source):
         return 0.0
     middle = transforms.apply(

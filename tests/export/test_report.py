@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import base64
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import cv2
 import numpy as np
 import pytest
-from helpers_scene import ICP_REPORT, make_pair, rasterise
+from helpers_scene import ICP_RESULT, make_pair, rasterise
 
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.types import Verdict
@@ -238,11 +239,11 @@ def test_metrics_are_told_with_their_units():
 
 
 def test_report_says_which_refinement_was_taken_and_why() -> None:
-    followed = descriptions.refinement_text(ICP_REPORT)
+    followed = descriptions.refinement_text(ICP_RESULT)
     assert "gicp" in followed
-    assert "reaches of 1, 0.5 m" in followed
+    assert "correspondences up to 1, 0.5 m" in followed
     assert "0.31" in followed
-    kept = {**ICP_REPORT, "chosen": "ground", "followed": False}
+    kept = replace(ICP_RESULT, chosen="ground", followed=False)
     assert "surfaces met worse" in descriptions.refinement_text(kept)
-    assert "lost the tie points" in descriptions.refinement_text({**kept, "lost_tie_points": True})
+    assert "lost the tie points" in descriptions.refinement_text(replace(kept, lost_tie_points=True))
     assert ("refined by", followed) in descriptions.transform_rows(make_pair(500))

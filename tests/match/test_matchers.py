@@ -16,11 +16,11 @@ from mtpcr_geo.cli.app import app
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import InputError, MissingPartError, MtpcrError, OptionError, RegistrationError
 from mtpcr_geo.core.grid import Grid
-from mtpcr_geo.core.types import Bev, Hypothesis, Look
-from mtpcr_geo.match.base import Features, PixelMatches, View, one_to_one
+from mtpcr_geo.core.types import Bev, Look, Matches, TiePoints
+from mtpcr_geo.match.base import Features, PixelMatches, View, margin_of, one_to_one
 from mtpcr_geo.match.correlation import CorrelationSettings
 from mtpcr_geo.match.descriptors import NearestNeighbours, Orb, RootSift
-from mtpcr_geo.match.keypoints import magnified, margin_of, turn_image
+from mtpcr_geo.match.keypoints import magnified, turn_image
 from mtpcr_geo.match.learned.lightglue import LightGlue, normalised
 from mtpcr_geo.match.learned.model_cards import ExtractorFile, MatcherFile, descriptions
 from mtpcr_geo.match.learned.onnx import OnnxExtractor, Running, filled, tiles
@@ -187,13 +187,13 @@ def test_lightglue_normalises_by_the_longer_edge():
     )
 
 
-def test_margin_counts_agreeing_matches():
-    def found(*counts: float) -> tuple[Hypothesis, ...]:
-        return tuple(Hypothesis(0.0, (0.0, 0.0), count) for count in counts)
-
-    assert margin_of(()) == 1.0
-    assert margin_of(found(6.0)) == 6.0
-    assert margin_of(found(6.0, 4.0)) == 1.5
+def test_margin_compares_the_best_with_the_next_distinct_hypothesis():
+    assert margin_of([]) == 1.0
+    assert margin_of([0.0, 0.0]) == 1.0
+    assert margin_of([6.0], floor=1.0) == 6.0
+    assert margin_of([6.0, 4.0], floor=1.0) == 1.5
+    assert margin_of([6.0]) == 1000.0
+    assert margin_of([6.0, 0.001]) == 1000.0
 
 
 # whole matchers
@@ -204,7 +204,7 @@ def test_descriptors_find_the_yaw_of_a_town(name):
     pair = make_pair(60_000, state="levelled")
     found = matcher(name).match(*views(pair))
     assert found.hypotheses[0].yaw == pytest.approx(YAW, abs=np.radians(2.0))
-    assert found.report["margin"] > 1.3
+    assert found.margin > 1.3
     again = matcher(name).match(*views(pair))
     np.testing.assert_array_equal(found.source_px, again.source_px)
 
@@ -303,16 +303,14 @@ def test_focus_matches_again_where_overlap_is_small():
     first = own.match(*views(pair))
     subjects = subjects_of(pair)
 
-    def view(bev: Bev) -> View:
-        return View(bev, image_of(bev, "band_pass"))
+    def again(source: Bev, target: Bev, yaw: float | None) -> Matches:
+        return own.match(*(View(bev, image_of(bev, "band_pass")) for bev in (source, target)), yaw=yaw)
 
-    kept = focus(own, first, subjects[0], subjects[1], view, FocusSettings(theta=0.5))
+    kept = focus(again, first, subjects[0], subjects[1], FocusSettings(theta=0.5))
     assert kept.report["focus"]["overlap"] == pytest.approx(0.8, abs=0.05)
     assert not kept.report["focus"]["applied"]
     np.testing.assert_array_equal(kept.source_px, first.source_px)
-    forced = focus(
-        own, first, subjects[0], subjects[1], view, FocusSettings(theta=1.0, finer=1.5, radius_m=40.0)
-    )
+    forced = focus(again, first, subjects[0], subjects[1], FocusSettings(theta=1.0, finer=1.5, radius_m=40.0))
     reported = forced.report["focus"]
     assert reported["applied"]
     assert reported["agreeing_after"] > reported["agreeing_before"]
@@ -342,7 +340,13 @@ def test_focus_goes_round_correlation_too():
     assert pair.target.bev is not None
     first = own.match(View(pair.source.bev), View(pair.target.bev))
     subjects = subjects_of(pair)
-    again = focus(own, first, subjects[0], subjects[1], View, FocusSettings(theta=1.0))
+    again = focus(
+        lambda s, t, yaw: own.match(View(s), View(t), yaw=yaw),
+        first,
+        subjects[0],
+        subjects[1],
+        FocusSettings(theta=1.0),
+    )
     assert again.report["focus"]["cells_m"] == [0.5, 0.5]
 
 
@@ -552,9 +556,9 @@ def test_lightglue_is_not_asked_about_no_keypoints(small_models):
 def test_one_match_is_refused_by_the_solver():
     from mtpcr_geo.method.solve import solve_tie_points
 
-    one = np.zeros((1, 3))
+    one, no = np.zeros((1, 3)), np.zeros(1, bool)
     with pytest.raises(RegistrationError, match="only 1 tie points"):
-        solve_tie_points(one, one, np.ones(1), np.zeros(1, bool), tolerance=1.0)
+        solve_tie_points(TiePoints(one, one, np.ones(1), np.ones(1, np.int64), no, ~no), 1.0)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
-from mtpcr_geo.method.bev import choose_cell, coarsen, density, grid_around, rasterise
+from mtpcr_geo.method.bev import choose_cell, coarsen, coverage_of, grid_around, rasterise
 
 
 def test_hand_worked_cells() -> None:
@@ -59,13 +59,13 @@ def test_density_counts_occupied_ground_only() -> None:
     xyz = rng.uniform(0, 20, (4000, 3))
     far = xyz + [1000.0, 0.0, 0.0]
     both = np.vstack([xyz, far])
-    assert density(both, len(both)).per_m2 == pytest.approx(density(xyz, len(xyz)).per_m2, rel=0.2)
+    assert coverage_of(both).per_m2 == pytest.approx(coverage_of(xyz).per_m2, rel=0.2)
 
 
 def test_the_sparser_cloud_sets_the_cell() -> None:
     rng = np.random.default_rng(4)
-    dense = density(rng.uniform(0, 100, (100_000, 3)), 100_000)
-    sparse = density(rng.uniform(0, 200, (13_000, 3)), 13_000)
+    dense = coverage_of(rng.uniform(0, 100, (100_000, 3))).per_m2
+    sparse = coverage_of(rng.uniform(0, 200, (13_000, 3))).per_m2
     assert choose_cell(dense, dense) == 1.0
     assert choose_cell(dense, sparse) > choose_cell(dense, dense)
 

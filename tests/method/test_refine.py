@@ -7,8 +7,8 @@ from helpers_scene import houses, make_pair
 from mtpcr_geo.benchmark.steps import follow, level_pair
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import RegistrationError
-from mtpcr_geo.core.types import TiePoints
-from mtpcr_geo.method.icp import FAR_REACH_M, NEAR_REACH_M, Method, Rounds, Surfaces, rounds_for
+from mtpcr_geo.core.types import IcpMethod, Refinement, TiePoints
+from mtpcr_geo.method.icp import FAR_DISTANCES_M, NEAR_DISTANCES_M, Rounds, Surfaces, rounds_for
 from mtpcr_geo.method.overlap import overlap_of
 from mtpcr_geo.method.refine import follow_icp, settle_on_ground
 from mtpcr_geo.verdict.evidence import gather, tie_points_agreeing
@@ -24,14 +24,16 @@ def off_by(yaw_deg: float, shift: tuple[float, float, float]) -> np.ndarray:
     return transforms.compose(transforms.yaw_matrix(np.radians(yaw_deg)), np.array(shift))
 
 
-def icp(source: np.ndarray, target: np.ndarray, T_start: np.ndarray, method: Method = "gicp") -> np.ndarray:
+def icp(
+    source: np.ndarray, target: np.ndarray, T_start: np.ndarray, method: IcpMethod = "gicp"
+) -> np.ndarray:
     return Surfaces(source, target, T_start).descend(T_start, Rounds((3.0, 1.5, 0.75)), method=method).T
 
 
 @pytest.mark.parametrize(
     ("method", "within"), [("gicp", 0.01), ("point_to_plane", 0.01), ("point_to_point", 0.06)]
 )
-def test_icp_comes_back_from_a_rough_start(clouds, method: Method, within: float) -> None:
+def test_icp_comes_back_from_a_rough_start(clouds, method: IcpMethod, within: float) -> None:
     source, target = clouds
     found = icp(source, target, off_by(0.7, (0.8, -0.6, 0.4)), method)
     corners = np.array([[50.0, 50, 0], [-50, 50, 0], [-50, -50, 0], [50, -50, 5]])
@@ -87,10 +89,11 @@ def test_overlap_is_what_both_fill() -> None:
 def test_reaches_grow_with_coarse_cells_and_end_alike() -> None:
     assert rounds_for(1.0) == rounds_for(2.0)
     fine, coarse = rounds_for(2.0), rounds_for(4.0)
-    assert fine["far"].reach_m == (*FAR_REACH_M, *NEAR_REACH_M)
-    assert fine["near"].reach_m == (*NEAR_REACH_M, NEAR_REACH_M[-1])
+    assert fine["far"].max_correspondence_distances_m == (*FAR_DISTANCES_M, *NEAR_DISTANCES_M)
+    assert fine["near"].max_correspondence_distances_m == (*NEAR_DISTANCES_M, NEAR_DISTANCES_M[-1])
     for name in ("far", "near"):
-        assert coarse[name].reach_m == tuple(2 * reach for reach in fine[name].reach_m)
+        doubled = tuple(2 * one for one in fine[name].max_correspondence_distances_m)
+        assert coarse[name].max_correspondence_distances_m == doubled
 
 
 def test_misfit_is_least_where_surfaces_meet_and_goes_with_the_frame(clouds) -> None:
@@ -141,8 +144,8 @@ def test_crops_that_lead_icp_off_the_ground_are_seen_through() -> None:
     )
     assert off(led_off) > 0.3
     assert off(found.T) < 0.1
-    assert not found.report["followed"]
-    assert not found.report["lost_tie_points"]
+    assert not found.followed
+    assert not found.lost_tie_points
 
 
 @pytest.mark.parametrize("keep_tie_points", [0.5, 0.0])
@@ -160,9 +163,11 @@ def test_icp_that_loses_the_ties_is_followed_only_where_that_is_asked(clouds, ke
     step = {"type": "mtpcr.refine", "tag": "refine", "keep_tie_points": keep_tie_points}
     refined = follow(pair, [step]).pair
     followed = keep_tie_points == 0.0
-    assert refined.refine_report["icp"]["followed"] is followed
-    assert refined.refine_report["icp"]["lost_tie_points"] is not followed
     assert refined.T_target_source is not None
+    assert refined.refinement is not None
+    assert refined.refinement.icp is not None
+    assert refined.refinement.icp.followed is followed
+    assert refined.refinement.icp.lost_tie_points is not followed
     assert tie_points_agreeing(refined, refined.T_target_source) == (0 if followed else 60)
     plan = np.linalg.norm(refined.T_target_source[:2, 3])
     assert plan < 0.05 if followed else plan == pytest.approx(np.hypot(2.2, 1.2), abs=0.05)
@@ -173,8 +178,12 @@ def test_way_from_the_ties_is_measured_in_plan() -> None:
     pair = make_pair(3000, tilt=4.0)
     up = transforms.inverse(pair.target.T_level_work)[:3, :3] @ np.array([0.0, 0.0, 2.5])
     assert pair.T_target_source is not None
-    raised = pair.with_(refine_report={"T_before": transforms.translation(-up) @ pair.T_target_source})
+    raised = pair.with_(
+        refinement=Refinement(pair.T_target_source, transforms.translation(-up) @ pair.T_target_source)
+    )
     assert gather(raised)[0].refined_away_m < 1e-9
     aside = transforms.inverse(pair.target.T_level_work)[:3, :3] @ np.array([1.5, -2.0, 0.0])
-    moved = pair.with_(refine_report={"T_before": transforms.translation(-aside) @ pair.T_target_source})
+    moved = pair.with_(
+        refinement=Refinement(pair.T_target_source, transforms.translation(-aside) @ pair.T_target_source)
+    )
     assert gather(moved)[0].refined_away_m == pytest.approx(2.5)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
-from mtpcr_geo.core.types import Bev, Matches
-from mtpcr_geo.method.inverse_mapping import folds_of, inverse_mapping
+from mtpcr_geo.core.types import Bev, Matches, TiePoints
+from mtpcr_geo.method.inverse_mapping import folds_of, tie_points_of
 from mtpcr_geo.method.solve import fit_rigid, fit_upright, iterative_svd, ransac_upright, solve_tie_points
 
 
@@ -67,13 +67,20 @@ def test_ransac_survives_outliers_that_one_svd_does_not() -> None:
     assert np.degrees(transforms.rotation_angle(plain.T[:3, :3] @ T[:3, :3].T)) > 5.0
 
 
+def tied(source: np.ndarray, target: np.ndarray, held_out: np.ndarray | None = None) -> TiePoints:
+    """Tie points of equal score, none held out unless said."""
+    n = len(source)
+    out = np.zeros(n, bool) if held_out is None else held_out
+    return TiePoints(source, target, np.ones(n), np.where(out, 0, 1), out, np.ones(n, bool))
+
+
 def test_solve_keeps_withheld_ties_out_and_finds_the_transform() -> None:
     source, target, T = outlier_heavy(4, 60, 40)
     held_out = np.arange(100) % 4 == 0
     lies = target.copy()
     lies[held_out] += 500.0
-    a, _ = solve_tie_points(source, target, np.ones(100), held_out, tolerance=1.0)
-    b, inlier = solve_tie_points(source, lies, np.ones(100), held_out, tolerance=1.0)
+    a, _ = solve_tie_points(tied(source, target, held_out), 1.0)
+    b, inlier = solve_tie_points(tied(source, lies, held_out), 1.0)
     assert np.array_equal(a.T, b.T)
     assert not inlier[held_out].any()
     assert np.linalg.norm(a.T[:3, 3] - T[:3, 3]) < 0.5
@@ -86,7 +93,7 @@ def test_few_agreeing_ties_do_not_take_in_the_rest(seed: int) -> None:
     # no rigid transform fits a shrunk scene but near one place; a threshold that grows with what it lets in
     # ends at 40 m and calls all of it agreement
     target = source * [0.9, 0.9, 1.0] + rng.normal(0, 3, (200, 3))
-    solution, agreeing = solve_tie_points(source, target, np.ones(200), np.zeros(200, bool), tolerance=3.0)
+    solution, agreeing = solve_tie_points(tied(source, target), 3.0)
     assert solution.threshold <= 6.0
     assert agreeing.sum() < 50
 
@@ -94,10 +101,10 @@ def test_few_agreeing_ties_do_not_take_in_the_rest(seed: int) -> None:
 def test_ties_that_do_not_agree_are_refused() -> None:
     rng = np.random.default_rng(5)
     with pytest.raises(RegistrationError, match="at least 3"):
-        solve_tie_points(np.zeros((2, 3)), np.zeros((2, 3)), np.ones(2), np.zeros(2, bool), tolerance=1.0)
+        solve_tie_points(tied(np.zeros((2, 3)), np.zeros((2, 3))), 1.0)
     source, target = rng.uniform(-1e3, 1e3, (5, 3)), rng.uniform(-1e3, 1e3, (5, 3))
     with pytest.raises(RegistrationError, match="agree"):
-        solve_tie_points(source, target, np.ones(5), np.zeros(5, bool), tolerance=0.5)
+        solve_tie_points(tied(source, target), 0.5)
 
 
 def test_folds_are_whole_blocks_and_move_with_the_scene() -> None:
@@ -114,7 +121,7 @@ def test_lifting_takes_pixel_centres_and_float_heights() -> None:
     top = np.array([[1.25, 2.5], [np.nan, 4.125]], np.float32)
     bev = Bev(Grid(100.0, 200.0, 2.0, 2, 2), top, top - 1, (~np.isnan(top)).astype(np.uint32))
     px = np.array([[0.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    tie_points = inverse_mapping(Matches(px, px, np.ones(3)), bev, bev, surface="top")
+    tie_points = tie_points_of(Matches(px, px, np.ones(3)), bev, bev, surface="top")
     assert tie_points.source.tolist() == [[101.0, 199.0, 1.25], [103.0, 197.0, 4.125]]
-    ground = inverse_mapping(Matches(px, px, np.ones(3)), bev, bev, surface="ground")
+    ground = tie_points_of(Matches(px, px, np.ones(3)), bev, bev, surface="ground")
     assert ground.source[:, 2].tolist() == [0.25, 0.25, 0.25]

@@ -8,12 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats, Grey
 from mtpcr_geo.core.errors import InputError
-from mtpcr_geo.match.base import Features, Grey, PixelMatches
+from mtpcr_geo.match.base import Features, PixelMatches
 from mtpcr_geo.match.learned.model_cards import FusedFile, MatcherFile
 from mtpcr_geo.match.learned.onnx import Graph, Running, as_input
-
-Floats = NDArray[np.float64]
 
 LEAST_EDGE = 128
 """Edge to which tiny images are padded: fused graphs want room for a fixed number of keypoints."""

@@ -12,8 +12,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Grey
 from mtpcr_geo.core.errors import InputError, MissingPartError
-from mtpcr_geo.match.base import Features, Grey
+from mtpcr_geo.match.base import Features
 from mtpcr_geo.match.learned.model_cards import ExtractorFile
 
 Device = Literal["auto", "cpu", "cuda"]

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from mtpcr_geo.match.base import Matcher, View
     from mtpcr_geo.match.correlation import Prior
 
-_OF_CORRELATION = {"yaw_step", "patch", "reach", "min_overlap", "prior_sigma"}
-_OF_KEYPOINTS = {
+_FOR_CORRELATION = {"yaw_step", "patch", "search_radius", "min_overlap", "prior_sigma"}
+_FOR_KEYPOINTS = {
     "models", "turns", "tolerance", "max_keypoints", "tile", "ratio", "cross_check", "device", "threads",
 }  # fmt: skip
 TOLERATED_ROTATION_DEG = 22.5
-"""Turn that every keypoint matcher bears, so that a yaw known as well as that needs no sweep."""
+"""Rotation that every keypoint matcher tolerates: a yaw known as well as that needs no sweep."""
 
 
 class EnhanceOptions(StageOptions):
@@ -61,8 +61,7 @@ class Enhance(Stage):
         return pair.with_(target=done[0], source=done[-1])
 
     def _look_at(self, side: Side) -> Appearance:
-        from mtpcr_geo.method.images import image_of
-        from mtpcr_geo.method.paper import grey
+        from mtpcr_geo.method.images import grey, image_of
 
         if side.bev is None:
             raise OptionError(f"{self.label} needs height rasters; put mtpcr.bev before it")
@@ -80,7 +79,7 @@ class MatchOptions(StageOptions):
     )
     yaw_step: float = Field(4.0, gt=0, le=30, description="step of the search over all yaws, degrees")
     patch: float = Field(24.0, gt=0, description="edge of a patch of the local matches, metres")
-    reach: float = Field(6.0, gt=0, description="how far a patch may lie from the hypothesis, metres")
+    search_radius: float = Field(6.0, gt=0, description="how far a patch may lie from the hypothesis, metres")
     min_overlap: float = Field(400.0, ge=0, description="smallest overlap considered, square metres")
     prior: Literal["none", "georef"] = Field(
         "none", description="georef starts from where both clouds' CRSs put them, and searches only near it"
@@ -140,8 +139,8 @@ class Match(Stage):
     def check(self, context: RunContext) -> None:
         """Find out whether there is such a matcher, with its files, and whether the options are its own."""
         correlation = self.options.method == "correlation"
-        foreign = self.options.model_fields_set & (_OF_KEYPOINTS if correlation else _OF_CORRELATION)
-        # words equal to the default say nothing
+        foreign = self.options.model_fields_set & (_FOR_KEYPOINTS if correlation else _FOR_CORRELATION)
+        # options equal to the default count as not given
         fields = type(self.options).model_fields
         reported = sorted(name for name in foreign if getattr(self.options, name) != fields[name].default)
         if reported:
@@ -187,7 +186,10 @@ class Match(Stage):
 
         o = self.options
         correlation = CorrelationSettings(
-            yaw_step_deg=o.yaw_step, patch_m=o.patch, reach_m=o.reach, min_overlap_m2=o.min_overlap
+            yaw_step_deg=o.yaw_step,
+            patch_m=o.patch,
+            search_radius_m=o.search_radius,
+            min_overlap_m2=o.min_overlap,
         )
         if o.method == "correlation":
             return CorrelationMatcher(correlation, prior)
@@ -212,7 +214,7 @@ class Match(Stage):
         if self.options.prior == "none":
             return None
         T = georeference(pair, self.label)
-        T_level = pair.target.T_level_work @ T @ transforms.inverse(pair.source.T_level_work)
+        T_level = pair.levelled(T)
         shift = (float(T_level[0, 3]), float(T_level[1, 3]))
         known = Hypothesis(transforms.yaw_of(T_level[:3, :3]), shift, 0.0)
         return Prior(known, 3.0 * self.options.prior_sigma, float(np.radians(self.options.prior_yaw)))
@@ -250,20 +252,21 @@ class Focus(Stage):
         first = pair.matches
         if first is None or first.matcher is None:
             raise OptionError(f"{self.label} needs matches; put mtpcr.match before it")
-        look = _look_of(pair.source)
+        matcher = first.matcher
+        look = _look_of(pair.source) if matcher.needs_image else None
         settings = FocusSettings(
             self.options.theta, self.options.finer, self.options.radius, self.options.finest
         )
         with context.progress.task("matching again", None) as advance:
             matches = focus(
-                first.matcher,
+                lambda s, t, yaw: matcher.match(
+                    _view(s, look), _view(t, look), seed=self.options.seed, yaw=yaw, advance=advance
+                ),
                 first,
                 Subject(pair.source.levelled_sample, source.grid),
                 Subject(pair.target.levelled_sample, target.grid),
-                lambda bev: _view(bev, look if first.matcher.needs_image else None),
                 settings,
                 self.options.seed,
-                advance,
             )
         self.metadata |= matches.report["focus"]
         return pair.with_(matches=matches)
@@ -271,8 +274,7 @@ class Focus(Stage):
 
 def _shown(side: Side) -> Side:
     """Return the side with an image of its raster, so that what was matched is on record."""
-    from mtpcr_geo.method.images import image_of
-    from mtpcr_geo.method.paper import grey
+    from mtpcr_geo.method.images import grey, image_of
 
     assert side.bev is not None
     known = side.appearance

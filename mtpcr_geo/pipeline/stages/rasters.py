@@ -7,20 +7,27 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.core.types import Pair, Side
+from mtpcr_geo.core.types import Bev, Pair, Side
+from mtpcr_geo.method.bev import (
+    Convention,
+    Coverage,
+    ceil_grid,
+    choose_cells,
+    coverage_of,
+    grid_around,
+    make_bev,
+    rasterise,
+)
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 
 if TYPE_CHECKING:
-    from mtpcr_geo.crs import FrameLink, WorkFrame
-    from mtpcr_geo.method.bev import Density
-
-Floats = NDArray[np.float64]
+    from mtpcr_geo.core.frames import FrameLink, WorkFrame
 
 
 class LevelOptions(StageOptions):
@@ -103,25 +110,17 @@ class Level(Stage):
         ]
         frame, *links = self._frames(target, source)
         sides = []
-        for role, cloud, link, looked in zip(("target", "source"), clouds, links, found, strict=False):
-            sample = in_work_frame(link, looked.sample)
-            upright = level(sample, options.method, link.file_crs is not None, options.seed)
+        roles: tuple[Literal["target", "source"], ...] = ("target", "source")
+        for role, cloud, link, scanned in zip(roles, clouds, links, found, strict=False):
+            sample = in_work_frame(link, scanned.sample)
+            levelling = level(sample, options.method, link.file_crs is not None, options.seed)
             self.metadata[role] = {
-                "points": looked.count,
-                "noise_points": looked.dropped,
-                "sampled": len(looked.sample),
-                **upright.report,
+                "points": scanned.count,
+                "noise_points": scanned.dropped,
+                "sampled": len(scanned.sample),
+                **levelling.audit(),
             }
-            sides.append(
-                Side(
-                    role,  # type: ignore[arg-type]
-                    cloud,
-                    link,
-                    sample,
-                    upright.T_level_work,
-                    {**upright.report, "complete": looked.complete},
-                )
-            )
+            sides.append(Side(role, cloud, link, sample, scanned.complete, levelling))
         return Pair(sides[0], sides[-1], frame)
 
 
@@ -173,61 +172,46 @@ class MakeBev(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Choose the cell and rasterise both sides."""
-        from mtpcr_geo.method.bev import Rasteriser, density, grid_around
-        from mtpcr_geo.method.paper import CeilRasteriser, ceil_grid
-
         pair = self.one_pair(inputs)
         sides = [pair.target] if pair.source is pair.target else [pair.target, pair.source]
-        densities = [density(side.sample, side.cloud.count) for side in sides]
-        cells = self._cells(sides, densities)
-        self.metadata |= {"cell_m": cells[-1], "cell_chosen": self.options.cell is None}
-        made = []
-        for side, dense, cell in zip(sides, densities, cells, strict=True):
-            levelled = side.levelled_sample
-            low, high = transforms.bounds(levelled)
-            whole = bool(side.level_report.get("complete", True))
-            if not whole:
-                # the sample may miss the outermost points
-                low, high = _levelled_bounds(side)
-            chunks = [levelled] if whole else _levelled_chunks(side, context)
-            if self.options.pixel == "ceil":
-                raster: Rasteriser = CeilRasteriser(ceil_grid(low, high, cell))
-            else:
-                raster = Rasteriser(grid_around(low, high, cell))
-            for chunk in chunks:
-                raster.add(chunk)
-            bev = raster.finish()
-            made.append(bev)
+        coverages = [_coverage(side) for side in sides]
+        options = self.options
+        cells = choose_cells(
+            coverages,
+            cell=options.cell,
+            finest=options.finest,
+            resolution=options.resolution,
+            gamma=options.gamma,
+        )
+        self.metadata |= {"cell_m": cells.cells_m[-1], "cell_chosen": options.cell is None}
+        if cells.gamma_m is not None:
+            self.metadata["gamma_m"] = cells.gamma_m
+        done = []
+        for side, coverage, cell in zip(sides, coverages, cells.cells_m, strict=True):
+            bev = _rasterised(side, cell, options.pixel, context)
+            done.append(replace(side, bev=bev))
             self.metadata[side.role] = {
                 "cell_m": cell,
                 "width": bev.grid.width,
                 "height": bev.grid.height,
                 "filled_share": float((bev.count > 0).mean()),
-                "points_per_m2": dense.per_m2,
-                "area_m2": dense.area_m2,
+                "points_per_m2": coverage.per_m2,
+                "area_m2": coverage.occupied_m2,
             }
-        done = [replace(side, bev=bev) for side, bev in zip(sides, made, strict=True)]
         return pair.with_(target=done[0], source=done[-1])
 
-    def _cells(self, sides: list[Side], densities: list[Density]) -> list[float]:
-        """Choose the cell of each side: one for both, or by Eq. 1."""
-        from mtpcr_geo.method import paper
-        from mtpcr_geo.method.bev import choose_cell
 
-        usual = self.options.cell or choose_cell(*densities, finest=self.options.finest)
-        if self.options.resolution == "common":
-            return [usual] * len(sides)
-        areas = [dense.area_m2 for dense in densities]
-        if self.options.resolution == "eq1":
-            spans = [np.subtract(*transforms.bounds(side.levelled_sample)[::-1]) for side in sides]
-            areas = [float(span[0] * span[1]) for span in spans]
-        counts = [side.cloud.count for side in sides]
-        gamma = self.options.gamma or paper.usual_gamma(
-            tuple(n / area for n, area in zip(counts, areas, strict=True)), usual
-        )
-        self.metadata["gamma_m"] = gamma
-        res = [paper.resolution(n, area, gamma) for n, area in zip(counts, areas, strict=True)]
-        return [paper.cell_of(one) for one in res]
+def _coverage(side: Side) -> Coverage:
+    return coverage_of(side.sample, side.levelled_sample, side.cloud.count)
+
+
+def _rasterised(side: Side, cell: float, convention: Convention, context: RunContext) -> Bev:
+    """Rasterise a side from its sample where that is the whole cloud, else from a pass over its points."""
+    if side.complete:
+        return make_bev(side.levelled_sample, cell, convention)
+    # the sample may miss the outermost points
+    lay = grid_around if convention == "centre" else ceil_grid
+    return rasterise(_levelled_chunks(side, context), lay(*_levelled_bounds(side), cell), convention)
 
 
 def _levelled_chunks(side: Side, context: RunContext) -> Iterator[Floats]:

@@ -7,15 +7,13 @@ from dataclasses import replace
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.core.types import Bev, Pair
+from mtpcr_geo.core.types import Bev, Pair, SolveSettings
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
-
-Floats = NDArray[np.float64]
 
 
 def georeference(pair: Pair, label: str) -> Floats:
@@ -81,13 +79,13 @@ class InverseMapping(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Lift the matches to tie points."""
-        from mtpcr_geo.method.inverse_mapping import inverse_mapping
+        from mtpcr_geo.method.inverse_mapping import tie_points_of
 
         pair = self.one_pair(inputs)
         source, target = bevs_of(self, pair)
         if pair.matches is None:
             raise OptionError(f"{self.label} needs matches; put mtpcr.match before it")
-        tie_points = inverse_mapping(
+        tie_points = tie_points_of(
             pair.matches,
             source,
             target,
@@ -140,36 +138,13 @@ class Solve(Stage):
             raise OptionError(f"{self.label} needs tie points; put mtpcr.inverse_mapping before it")
         tie_points = pair.tie_points
         tolerance = self.options.tolerance or 1.5 * pair.cell
-        solution, inlier = solve_tie_points(
-            tie_points.source,
-            tie_points.target,
-            tie_points.score,
-            tie_points.held_out,
-            tolerance=tolerance,
-            robust_start=self.options.robust_start,
-            upright=self.options.upright,
-            tries=self.options.tries,
-            seed=self.options.seed,
-        )
+        options = self.options
+        settings = SolveSettings(options.robust_start, options.upright, options.tries, options.seed)
+        solution, inlier = solve_tie_points(tie_points, tolerance, settings)
         T_work_level = transforms.inverse(pair.target.T_level_work)
         T = T_work_level @ solution.T @ pair.source.T_level_work
-        report = {
-            "used": int((~tie_points.held_out).sum()),
-            "inliers": int(solution.inlier.sum()),
-            "iterations": solution.iterations,
-            "threshold_m": solution.threshold,
-            "yaw_deg": float(np.degrees(transforms.yaw_of(solution.T[:3, :3]))),
-            "settings": {
-                "robust_start": self.options.robust_start,
-                "upright": self.options.upright,
-                "tries": self.options.tries,
-                "seed": self.options.seed,
-            },
-        }
-        self.metadata |= report
-        return pair.with_(
-            T_target_source=T, tie_points=replace(tie_points, inlier=inlier), solve_report=report
-        )
+        self.metadata |= solution.audit()
+        return pair.with_(T_target_source=T, tie_points=replace(tie_points, inlier=inlier), solution=solution)
 
 
 class RefineOptions(StageOptions):
@@ -179,7 +154,7 @@ class RefineOptions(StageOptions):
         "gicp", description="ICP variant; point_to_point is what the paper cites"
     )
     voxel: float = Field(0.5, gt=0, description="thinning of the points, metres; grows with large overlaps")
-    reach: list[float] | None = Field(
+    max_correspondence_distance: list[float] | None = Field(
         None,
         min_length=1,
         description="farthest correspondence of each round, metres; if not given, far and near rounds are "
@@ -214,53 +189,46 @@ class Refine(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Refine the solved transform."""
-        from mtpcr_geo.method.icp import Rounds, Surfaces, rounds_for
-        from mtpcr_geo.method.refine import beyond_scatter, constrain, follow_icp, settle_on_ground
+        from mtpcr_geo.method.refine import RefineSettings, refine
         from mtpcr_geo.verdict.evidence import tie_points_agreeing
 
         pair = self.one_pair(inputs)
         if pair.T_target_source is None:
             raise OptionError(f"{self.label} needs a transform; put mtpcr.solve before it")
-        source, target, T = pair.source.sample, pair.target.sample, pair.T_target_source
-        report: dict[str, object] = {}
-        starts = {"tie_points": T}
-        if self.options.ground:
-            settled = settle_on_ground(source, target, T, tilt=True)
-            T, report["ground_before"] = settled.T, settled.report
-            starts["ground"] = T
-        if self.options.method != "none":
-            reach = self.options.reach
-            rounds = {"asked": Rounds(tuple(reach))} if reach else rounds_for(pair.cell)
-            surfaces = Surfaces(
-                source,
-                target,
-                T,
-                voxel_m=self.options.voxel,
-                reach_m=max(max(one.reach_m) for one in rounds.values()),
-                max_points=self.options.max_points,
-            )
-            refined = follow_icp(
-                surfaces,
-                starts,
-                rounds=rounds,
-                agreeing=lambda T: tie_points_agreeing(pair, T),
-                keep_tie_points=self.options.keep_tie_points,
-                method=self.options.method,
-                iterations=self.options.iterations,
-            )
-            T, report["icp"] = refined.T, refined.report
-        if self.options.ground:
-            settled = settle_on_ground(source, target, T, tilt=False)
-            followed = self.options.method == "none" or beyond_scatter(settled)
-            report["ground_after"] = {**settled.report, "followed": followed}
-            T = settled.T if followed else T
-        if self.options.motion != "rigid" and pair.tie_points is not None:
-            T_work_level = transforms.inverse(pair.source.T_level_work)
-            pivot = transforms.apply(T_work_level, pair.tie_points.source.mean(axis=0, keepdims=True))[0]
-            upright = transforms.inverse(pair.target.T_level_work)[:3, :3] @ pair.source.T_level_work[:3, :3]
-            T = constrain(T, self.options.motion, pivot, upright)
-        self.metadata |= report
-        return pair.with_(T_target_source=T, refine_report={**report, "T_before": pair.T_target_source})
+        options = self.options
+        distances = options.max_correspondence_distance
+        settings = RefineSettings(
+            method=None if options.method == "none" else options.method,
+            voxel_m=options.voxel,
+            max_correspondence_distances_m=None if distances is None else tuple(distances),
+            max_points=options.max_points,
+            iterations=options.iterations,
+            # without tie points there is no middle of the overlap to hold
+            motion="rigid" if pair.tie_points is None else options.motion,
+            ground=options.ground,
+            keep_tie_points=options.keep_tie_points,
+        )
+        refinement = refine(
+            pair.source.sample,
+            pair.target.sample,
+            pair.T_target_source,
+            settings,
+            cell=pair.cell,
+            agreeing=lambda T: tie_points_agreeing(pair, T),
+            pivot=_middle_of_tie_points(pair),
+            R_upright=pair.target.T_level_work[:3, :3].T @ pair.source.T_level_work[:3, :3],
+        )
+        self.metadata |= refinement.audit()
+        return pair.with_(T_target_source=refinement.T, refinement=refinement)
+
+
+def _middle_of_tie_points(pair: Pair) -> Floats | None:
+    """Return the mean of the tie points' source ends, (3,) source work coordinates; None without any."""
+    if pair.tie_points is None or not len(pair.tie_points):
+        return None
+    T_work_level = transforms.inverse(pair.source.T_level_work)
+    middle = pair.tie_points.source.mean(axis=0, keepdims=True)
+    return np.asarray(transforms.apply(T_work_level, middle)[0])
 
 
 class AssessOptions(StageOptions):
@@ -317,12 +285,14 @@ class Assess(Stage):
 
     def _no_worse_than_prior(self, pair: Pair) -> Pair:
         """Keep the transform known beforehand where more tie points and as much ground agree with it."""
-        from mtpcr_geo.verdict.evidence import agreement
+        from mtpcr_geo.verdict.evidence import prior_or_found
 
         if pair.T_prior is None or pair.T_target_source is None:
             return pair
-        found = agreement(pair, pair.T_target_source, self.options.tolerance)
-        known = agreement(pair, pair.T_prior, self.options.tolerance)
-        better = known[0] >= found[0] and known[1] >= found[1]
-        self.metadata |= {"ties_and_ground_agreeing": found, "with_prior": known, "prior_kept": better}
-        return pair.with_(T_target_source=pair.T_prior) if better else pair
+        compared = prior_or_found(pair, self.options.tolerance)
+        self.metadata |= {
+            "tie_points_and_ground_agreeing": compared.found,
+            "with_prior": compared.prior,
+            "prior_kept": compared.keep_prior,
+        }
+        return pair.with_(T_target_source=pair.T_prior) if compared.keep_prior else pair
