@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -23,7 +24,7 @@ PAIRS = {
 FAST = ["delft_urban_ahn3", "park_two_epochs_ttp"]
 
 
-def crs_of(name: str) -> dict[str, str]:
+def crs_of(name: str) -> dict[str, Any]:
     return {"source_crs": "EPSG:28992", "target_crs": "EPSG:28992"} if name.startswith("delft") else {}
 
 

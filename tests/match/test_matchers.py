@@ -255,7 +255,12 @@ def test_superpoint_and_lightglue_of_random_weights_run_the_whole_path(town_file
 
 def test_paper_profile_runs_the_whole_path(town_files, small_models, tmp_path):
     result = register(
-        *town_files, tmp_path / "out", profile="paper", matcher="superpoint", models=small_models
+        town_files[0],
+        town_files[1],
+        tmp_path / "out",
+        profile="paper",
+        matcher="superpoint",
+        models=small_models,
     )
     types = [entry["type"] for entry in result.report]
     steps = ["mtpcr.enhance", "mtpcr.match", "mtpcr.focus", "mtpcr.inverse_mapping"]
@@ -485,7 +490,7 @@ def test_options_of_the_other_kind_are_refused(town_files, tmp_path):
 
 def test_correlation_wants_one_cell_size(town_files, tmp_path):
     with pytest.raises(OptionError, match="one cell size"):
-        register(*town_files, tmp_path / "out", profile="paper", matcher="correlation")
+        register(town_files[0], town_files[1], tmp_path / "out", profile="paper", matcher="correlation")
 
 
 def test_not_a_graph(small_models, tmp_path):

@@ -198,7 +198,7 @@ def test_clean_then_register(pdal, town_files, tmp_path, monkeypatch):
 def test_plain_pdal_applies_the_transform_as_we_do(where, pdal, request, tmp_path, monkeypatch):
     if where == "town":
         source, target = request.getfixturevalue("town_files")
-        options = {}
+        options: dict[str, Any] = {}
     else:
         folder = request.getfixturevalue("shared_data") / "delft_urban_ahn3"
         source, target = folder / "source.laz", folder / "target.laz"

@@ -32,7 +32,7 @@ def files_below(folder: Path) -> list[Path]:
 @pytest.fixture(scope="module")
 def registered(town_files, tmp_path_factory):
     out = tmp_path_factory.mktemp("run") / "out"
-    return register(*town_files, out), out
+    return register(town_files[0], town_files[1], out), out
 
 
 def test_register_brings_the_source_home_and_leaves_everything(registered):
@@ -73,7 +73,7 @@ def test_registered_cloud_keeps_count_and_moves_every_point(registered, town_fil
 
 def test_dumped_pipeline_gives_the_same_bits(registered, town_files, tmp_path):
     result, out = registered
-    stages = build_pipeline(*town_files, tmp_path / "again", RegisterOptions())
+    stages = build_pipeline(town_files[0], town_files[1], tmp_path / "again", RegisterOptions())
     text = grammar.dump(stages)
     again = execute(grammar.link(grammar.parse(text)), Settings())
     assert again.pair is not None
@@ -84,7 +84,7 @@ def test_dumped_pipeline_gives_the_same_bits(registered, town_files, tmp_path):
 
 
 def test_another_seed_is_in_the_dump(town_files, tmp_path):
-    stages = build_pipeline(*town_files, tmp_path, RegisterOptions(seed=5))
+    stages = build_pipeline(town_files[0], town_files[1], tmp_path, RegisterOptions(seed=5))
     assert {stage["type"] for stage in stages if stage.get("seed") == 5} >= {"mtpcr.level", "mtpcr.solve"}
 
 
@@ -143,7 +143,7 @@ def test_crop_count_and_arrays_without_pdal(town_files, monkeypatch):
 
 
 def test_refused_run_keeps_evidence_and_writes_no_result(town_files, tmp_path):
-    stages = build_pipeline(*town_files, tmp_path / "out", RegisterOptions(recording=False))
+    stages = build_pipeline(town_files[0], town_files[1], tmp_path / "out", RegisterOptions(recording=False))
     next(stage for stage in stages if stage["type"] == "mtpcr.assess")["neg_log10_p"] = 1e9
     next(stage for stage in stages if stage["type"] == "mtpcr.assess")["margin"] = 1e9
     result = execute(grammar.link(grammar.parse(grammar.dump(stages))))
@@ -161,7 +161,7 @@ def test_registration_that_finds_nothing_is_refused_with_evidence(town_files, tm
         raise RegistrationError("no part of the source looks like the target")
 
     monkeypatch.setattr("mtpcr_geo.match.correlation.match", nothing)
-    result = register(*town_files, tmp_path / "out", recording=False)
+    result = register(town_files[0], town_files[1], tmp_path / "out", recording=False)
     assert result.verdict.name == "refused"
     assert "looks like" in result.verdict.reasons[0]
     written = {path.name for path in files_below(tmp_path)}
@@ -175,5 +175,5 @@ def test_interrupted_run_leaves_nothing(town_files, tmp_path, monkeypatch):
 
     monkeypatch.setattr("mtpcr_geo.verdict.decision.assess", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        register(*town_files, tmp_path / "out", recording=False)
+        register(town_files[0], town_files[1], tmp_path / "out", recording=False)
     assert not (tmp_path / "out").exists()
