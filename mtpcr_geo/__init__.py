@@ -2,10 +2,11 @@
 
 from typing import TYPE_CHECKING, Any
 
+from mtpcr_geo.core.version import __version__
+
 if TYPE_CHECKING:
     from mtpcr_geo.pipeline.api import Pipeline
 
-__version__ = "0.1.0"
 __all__ = ["Pipeline", "__version__"]
 
 
