@@ -1,4 +1,4 @@
-"""Lets ``python -m mtpcr_geo`` do what ``mtpcr-geo`` does."""
+"""Run the command: ``python -m mtpcr_geo`` does what ``mtpcr-geo`` does."""
 
 from mtpcr_geo.cli.app import main
 

@@ -127,7 +127,7 @@ def make_sides(n: int = 20_000, crs: str | None = "EPSG:25833", tilt: float = 0.
 
     def side(role: Literal["source", "target"], xyz: np.ndarray, origin: np.ndarray, T: np.ndarray) -> Side:
         side_crs = known if role == "target" else None
-        link = FrameLink(side_crs, origin)
+        link = FrameLink(side_crs, origin, georeferenced=side_crs is not None)
         cloud = ArrayCloud(link.to_file(xyz), side_crs, f"{role}.laz")
         bev = rasterise(transforms.apply(T, xyz), cell)
         return Side(role, cloud, link, xyz, True, Levelling(T, "plane" if tilt else "none"), bev)

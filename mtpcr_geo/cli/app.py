@@ -1,86 +1,206 @@
-"""The command: one thin function a verb. Everything heavy is imported where it is used."""
+"""The command: a table of verbs, and one place where errors become a line and an exit code.
+
+Nothing of a verb is imported before it is called or its help is asked for.
+"""
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import signal
-from enum import StrEnum
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 import mtpcr_geo
-from mtpcr_geo.benchmark.command import benchmark
-from mtpcr_geo.cli.shared import AsJson, Overwrite, Quiet, Verbose, progress_bars
-from mtpcr_geo.core.errors import EXIT_DOUBTFUL, EXIT_REFUSED, MtpcrError, OptionError
+from mtpcr_geo.core.errors import EXIT_INTERRUPTED, MtpcrError, OptionError, one_line
+from mtpcr_geo.core.suggestions import meant
 
-if TYPE_CHECKING:
-    from mtpcr_geo.registration import Registration
-
-EXIT_BY_VERDICT = {"accepted": 0, "doubtful": EXIT_DOUBTFUL, "refused": EXIT_REFUSED}
-EXIT_INTERRUPTED = 130
+NAME = "mtpcr-geo"
 
 
-class _Group(TyperGroup):
-    """Turns whatever a user can cause into one line on standard error and an exit code."""
+@dataclass(frozen=True)
+class Verb:
+    """A verb of the command.
+
+    Attributes:
+        function: "module:function" of what typer makes a command of.
+        help: what it does, in a line; the first line of the function's docstring.
+        more: it takes arguments beside its own options.
+
+    """
+
+    function: str
+    help: str
+    more: bool = False
+
+
+VERBS = {
+    "register": Verb(
+        "mtpcr_geo.cli.register:command",
+        "Bring SOURCE to TARGET; write the registered cloud, its transform and the evidence to a folder.",
+    ),
+    "check": Verb(
+        "mtpcr_geo.cli.check:command",
+        "Report what one or two clouds are and what is wrong with them, before they are registered.",
+    ),
+    "apply": Verb(
+        "mtpcr_geo.cli.apply:command", "Move a cloud by the transform of a registration, streamed."
+    ),
+    "pipeline": Verb(
+        "mtpcr_geo.cli.pipeline:command",
+        "Run a pipeline of this package's stages and PDAL's, written as PDAL's JSON.",
+        more=True,
+    ),
+    "models": Verb(
+        "mtpcr_geo.cli.models:command",
+        "List the learned matchers: which files are there, their licences, and who publishes those missing.",
+    ),
+    "demo": Verb(
+        "mtpcr_geo.cli.demo_verb:command",
+        "Register a simulated town, scanned from a street and from the air, and compare with the truth.",
+    ),
+    "benchmark": Verb(
+        "mtpcr_geo.benchmark.command:benchmark",
+        "Run methods on pairs with a known transform, from random starts; write tables and plots.",
+    ),
+}
+# typer offers this exception alone, whose base is every fault of a command line
+_UsageError: type[Exception] = typer.BadParameter.__bases__[0]
+_CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
+
+
+class Command(TyperCommand):
+    """A verb's command: its options stand in groups, its examples at the end of the help."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the arguments; an error names the verb, and the nearest option for a misspelt one."""
+        try:
+            return super().parse_args(ctx, args)
+        except _UsageError as error:
+            known = [name for one in self.get_params(ctx) for name in (*one.opts, *one.secondary_opts)]
+            raise _option_error(
+                error, f"{NAME} {self.name}", [name for name in known if name.startswith("--")]
+            ) from None
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write arguments, then options by group, in the order of their declaration."""
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for one in self.get_params(ctx):
+            record = one.get_help_record(ctx)
+            if record is not None:
+                by_place = one.param_type_name == "argument"
+                group = "Arguments" if by_place else getattr(one, "rich_help_panel", None) or "Options"
+                groups.setdefault(group, []).append(record)
+        for group, records in groups.items():
+            with formatter.section(group):
+                formatter.write_dl(records)
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Write the examples as they stand."""
+        if self.epilog:
+            formatter.write(f"\nExamples:\n{self.epilog}\n")
+
+
+class Group(TyperGroup):
+    """The group of verbs, each imported when it is wanted."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of the verbs."""
+        return list(VERBS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a verb's command, or None."""
+        return load(cmd_name) if cmd_name in VERBS else None
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write each verb with its line, from the table."""
+        with formatter.section("Verbs"):
+            formatter.write_dl([(name, verb.help) for name, verb in VERBS.items()])
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the verb; a misspelt one names the nearest."""
+        if args[0] not in VERBS:
+            raise OptionError(f"there is no verb {args[0]!r}{meant(args[0], VERBS)}")
+        return super().resolve_command(ctx, args)
+
+    def make_context(self, *args: Any, **kwargs: Any) -> Any:
+        """Read what stands before the verb."""
+        with _errors_in_one_line():
+            return super().make_context(*args, **kwargs)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the options of the command itself; without any argument, show the help."""
+        if not args:
+            typer.echo(ctx.get_help(), err=True)
+            raise typer.Exit(OptionError.exit_code)
+        try:
+            return super().parse_args(ctx, args)
+        except _UsageError as error:
+            raise _option_error(error, NAME, ["--help", "--version"]) from None
 
     def invoke(self, ctx: Any) -> Any:
-        try:
+        """Run the verb."""
+        with _errors_in_one_line():
             return super().invoke(ctx)
-        except MtpcrError as error:
-            typer.echo(f"mtpcr-geo: error: {' '.join(str(error).split())}", err=True)
-            raise typer.Exit(error.exit_code) from None
-        except KeyboardInterrupt:
-            typer.echo("mtpcr-geo: interrupted; no half-written file is left", err=True)
-            raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def load(name: str) -> Any:
+    """Import a verb, and make its command; the docstring of its function is the help."""
+    verb = VERBS[name]
+    module, _, attribute = verb.function.partition(":")
+    function = getattr(importlib.import_module(module), attribute)
+    text, _, examples = (inspect.getdoc(function) or "").partition("\nExamples:\n")
+    more = {"allow_extra_args": True, "ignore_unknown_options": True} if verb.more else {}
+    alone = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    alone.command(
+        name, cls=Command, help=text, epilog=examples.rstrip(), context_settings={**_CONTEXT, **more}
+    )(function)
+    return typer.main.get_command(alone)
+
+
+@contextmanager
+def _errors_in_one_line() -> Iterator[None]:
+    """Turn whatever a user can cause into one line on standard error and an exit code."""
+    try:
+        yield
+    except MtpcrError as error:
+        typer.echo(f"{NAME}: error: {one_line(str(error))}", err=True)
+        raise typer.Exit(error.exit_code) from None
+    except KeyboardInterrupt:
+        typer.echo(f"{NAME}: interrupted; no half-written file is left", err=True)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def _option_error(error: Any, what: str, valid: list[str]) -> OptionError:
+    """Say what is wrong with a command line, in a line."""
+    unknown = getattr(error, "option_name", None) if hasattr(error, "possibilities") else None
+    if unknown is not None:
+        return OptionError(
+            f"{what} has no option {unknown!r}{meant(unknown, valid) or f'; see {what} --help'}"
+        )
+    message = error.format_message().rstrip(".")
+    return OptionError(f"{message[:1].lower()}{message[1:]}; see {what} --help")
 
 
 app = typer.Typer(
-    name="mtpcr-geo",
-    cls=_Group,
+    name=NAME,
+    cls=Group,
     help="Register ground and aerial lidar clouds through bird's-eye-view height images.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
+    context_settings=_CONTEXT,
 )
-
-
-class Level(StrEnum):
-    """How to make clouds upright."""
-
-    auto = "auto"
-    ransac = "ransac"
-    none = "none"
-
-
-class Vertical(StrEnum):
-    """What to do with different vertical datums."""
-
-    refuse = "refuse"
-    assume_same = "assume-same"
-    estimate = "estimate"
-
-
-class Prior(StrEnum):
-    """Where the search starts."""
-
-    none = "none"
-    georef = "georef"
-
-
-class Motion(StrEnum):
-    """Degrees of freedom of the result."""
-
-    rigid = "rigid"
-    yaw = "yaw"
-    translation = "translation"
 
 
 def _version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"mtpcr-geo {mtpcr_geo.__version__}")
+        typer.echo(f"{NAME} {mtpcr_geo.__version__}")
         raise typer.Exit
 
 
@@ -93,277 +213,15 @@ def _root(
     pass
 
 
-@app.command()
-def register(
-    source: Annotated[Path, typer.Argument(help="Cloud that moves: LAS, LAZ or COPC.", show_default=False)],
-    target: Annotated[Path, typer.Argument(help="Cloud that stays: LAS, LAZ or COPC.", show_default=False)],
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for the result and its evidence.", show_default=False)
-    ],
-    source_crs: Annotated[
-        str | None,
-        typer.Option(help="CRS of the source, instead of what its file states; such as EPSG:2154."),
-    ] = None,
-    target_crs: Annotated[
-        str | None, typer.Option(help="CRS of the target, instead of what its file states.")
-    ] = None,
-    local: Annotated[bool, typer.Option("--local", help="Both clouds are local, in metres.")] = False,
-    level: Annotated[Level, typer.Option(help="How to make the clouds upright.")] = Level.auto,
-    cell: Annotated[
-        float | None, typer.Option(help="Cell of the height rasters in metres; chosen if not given.")
-    ] = None,
-    vertical: Annotated[
-        Vertical, typer.Option(help="What to do with different or unknown vertical datums.")
-    ] = Vertical.refuse,
-    out_crs: Annotated[
-        str | None, typer.Option(help="CRS of the result, where it shall not be the target's.")
-    ] = None,
-    prior: Annotated[
-        Prior, typer.Option(help="georef: search only near where both clouds' CRSs put them.")
-    ] = Prior.none,
-    no_prior: Annotated[
-        bool, typer.Option("--no-prior", help="Do not use the clouds' shared georeference (the default).")
-    ] = False,
-    prior_sigma: Annotated[
-        float, typer.Option(help="With --prior: standard deviation of the source's place, metres.")
-    ] = 5.0,
-    prior_yaw: Annotated[float, typer.Option(help="With --prior: largest turn considered, degrees.")] = 5.0,
-    motion: Annotated[Motion, typer.Option(help="Degrees of freedom of the result.")] = Motion.rigid,
-    profile: Annotated[
-        str, typer.Option(help="Which steps and settings to run: default, or paper (MT-PCR as published).")
-    ] = "default",
-    matcher: Annotated[
-        str | None,
-        typer.Option(help="Matcher: correlation, rootsift, orb, or a learned one (see: mtpcr-geo models)."),
-    ] = None,
-    models_folder: Annotated[
-        Path | None,
-        typer.Option("--models", help="Folder of model files, instead of $MTPCR_GEO_MODELS."),
-    ] = None,
-    no_res: Annotated[
-        bool, typer.Option("--no-res", help="Paper's profile: no resolution by density (Eq. 1).")
-    ] = False,
-    no_focus: Annotated[
-        bool, typer.Option("--no-focus", help="Paper's profile: do not match again where overlap is small.")
-    ] = False,
-    no_enhance: Annotated[
-        bool, typer.Option("--no-enhance", help="Paper's profile: do not sharpen the images (Eq. 4).")
-    ] = False,
-    seed: Annotated[int, typer.Option(help="Seed of everything random.")] = 0,
-    overwrite: Overwrite = False,
-    force: Annotated[
-        bool, typer.Option("--force", help="Write the registered cloud though the verdict refuses it.")
-    ] = False,
-    no_recording: Annotated[bool, typer.Option("--no-recording", help="Keep no recording.")] = False,
-    dump_pipeline: Annotated[
-        bool, typer.Option("--dump-pipeline", help="Print the run as pipeline JSON, and do not run it.")
-    ] = False,
-    as_json: AsJson = False,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
-) -> None:
-    """Bring SOURCE to TARGET; write the registered cloud, its transform and the evidence to a folder.
-
-    Exit code 0: accepted; 3: doubtful; 4: refused (evidence only); others: see the manual.
-    """
-    from mtpcr_geo.pipeline.grammar import dump
-    from mtpcr_geo.registration import build_pipeline, read_options
-    from mtpcr_geo.registration import register as run
-
-    words = {
-        "source_crs": source_crs, "target_crs": target_crs, "local": local, "level": level.value,
-        "cell": cell, "profile": profile, "matcher": matcher, "models": models_folder,
-        "res": not no_res, "focus": not no_focus, "enhance": not no_enhance,
-        "seed": seed, "vertical": vertical.value, "out_crs": out_crs,
-        "prior": "none" if no_prior else prior.value, "prior_sigma": prior_sigma, "prior_yaw": prior_yaw,
-        "motion": motion.value,
-        "recording": not no_recording, "force": force, "overwrite": overwrite,
-    }  # fmt: skip
-    if dump_pipeline:
-        typer.echo(dump(build_pipeline(source, target, out, read_options(words))))
-        return
-    with progress_bars(quiet) as progress:
-        result = run(source, target, out, progress=progress, **words)
-    _report(result, as_json=as_json, verbose=verbose, quiet=quiet)
-    raise typer.Exit(EXIT_BY_VERDICT[result.verdict.name])
-
-
-@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
-def pipeline(
-    context: typer.Context,
-    file: Annotated[
-        Path | None, typer.Argument(help="Pipeline JSON; - reads standard input.", show_default=False)
-    ] = None,
-    check: Annotated[
-        bool, typer.Option("--validate", help="Check grammar, options, files and CRS; run nothing.")
-    ] = False,
-    metadata: Annotated[
-        Path | None, typer.Option(help="Write what the stages noted to this JSON file.", show_default=False)
-    ] = None,
-    progress: Annotated[
-        bool, typer.Option("--progress", help="Show bars even where standard error is no terminal.")
-    ] = False,
-    schema: Annotated[
-        bool, typer.Option("--schema", help="Print the JSON Schema of pipelines, for editors.")
-    ] = False,
-    allow_code: Annotated[
-        bool, typer.Option("--allow-code", help="Let stages such as filters.python run code.")
-    ] = False,
-    allow_network: Annotated[
-        bool, typer.Option("--allow-network", help="Let stages read remote or virtual (/vsi) files.")
-    ] = False,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
-) -> None:
-    """Run a pipeline of our stages and PDAL's, written as PDAL's JSON.
-
-    Options of stages are changed by --TYPE.OPTION=VALUE, such as --readers.las.filename=a.laz, or by
-    --TAG.OPTION=VALUE. Relative filenames are relative to the current folder.
-    """
-    from mtpcr_geo.cli import pipeline_verb
-
-    if schema:
-        pipeline_verb.print_schema()
-        return
-    if file is None:
-        raise OptionError("name a pipeline file, or - for standard input")
-    with progress_bars(quiet, always=progress) as bars:
-        outcome = pipeline_verb.run_pipeline(
-            file,
-            context.args,
-            check=check,
-            metadata=metadata,
-            overwrite=overwrite,
-            allow_code=allow_code,
-            allow_network=allow_network,
-            progress=bars,
-        )
-    pipeline_verb.print_outcome(outcome, as_json=as_json, verbose=verbose, quiet=quiet)
-    verdict = outcome.verdict if outcome is not None else None
-    raise typer.Exit(EXIT_BY_VERDICT[verdict.name] if verdict is not None else 0)
-
-
-@app.command()
-def apply(
-    transform: Annotated[Path, typer.Argument(help="A transform.json of a run.", show_default=False)],
-    cloud: Annotated[Path, typer.Argument(help="Cloud to move: LAS, LAZ or COPC.", show_default=False)],
-    out: Annotated[Path, typer.Argument(help="File to write: .las or .laz.", show_default=False)],
-    inverse: Annotated[bool, typer.Option("--inverse", help="From target to source instead.")] = False,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-) -> None:
-    """Stream any cloud through the transform of a run."""
-    from mtpcr_geo.export.apply import apply_transform
-
-    with progress_bars(quiet) as progress:
-        written = apply_transform(
-            transform, cloud, out, inverse=inverse, overwrite=overwrite, progress=progress
-        )
-    if not quiet:
-        typer.echo(f"wrote {written}")
-
-
-@app.command()
-def check(
-    source: Annotated[
-        Path, typer.Argument(help="Cloud that would move, or the only one.", show_default=False)
-    ],
-    target: Annotated[
-        Path | None, typer.Argument(help="Cloud that would stay; one cloud may do.", show_default=False)
-    ] = None,
-    source_crs: Annotated[
-        str | None, typer.Option(help="CRS of the source, instead of what its file states.")
-    ] = None,
-    target_crs: Annotated[
-        str | None, typer.Option(help="CRS of the target, instead of what its file states.")
-    ] = None,
-    local: Annotated[bool, typer.Option("--local", help="Both clouds are local, in metres.")] = False,
-    vertical: Annotated[
-        Vertical, typer.Option(help="What to do with different or unknown vertical datums.")
-    ] = Vertical.refuse,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")] = False,
-    quiet: Quiet = False,
-) -> None:
-    """Say what two clouds are and what is wrong with them, before they are registered.
-
-    Exit code 0: register would go on; else the code with which it would end.
-    """
-    from mtpcr_geo.check import check_clouds
-    from mtpcr_geo.check.show import show
-
-    with progress_bars(quiet) as progress:
-        report = check_clouds(
-            source,
-            target,
-            source_crs=source_crs,
-            target_crs=target_crs,
-            local=local,
-            vertical=vertical.value,
-            progress=progress,
-        )
-    show(report, as_json=as_json, quiet=quiet)
-    raise typer.Exit(report.exit_code)
-
-
-@app.command()
-def models(
-    folder: Annotated[
-        Path | None,
-        typer.Option("--models", help="Folder of model files, instead of $MTPCR_GEO_MODELS."),
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")] = False,
-) -> None:
-    """List the learned matchers: which files are there, their licences, and who publishes those missing."""
-    from mtpcr_geo.cli.pipeline_verb import print_models
-
-    print_models(folder, as_json=as_json)
-
-
-@app.command()
-def demo(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the demo's files.")] = Path(
-        "mtpcr-demo"
-    ),
-    seed: Annotated[int, typer.Option(help="Seed of the simulated town.")] = 0,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-) -> None:
-    """Simulate a town, scan it from a street and from the air, register the two, compare with the truth."""
-    from mtpcr_geo.cli.demo import run_demo
-
-    with progress_bars(quiet) as progress:
-        result = run_demo(out, seed=seed, overwrite=overwrite, progress=progress)
-    _report(result.registration, as_json=False, verbose=False, quiet=quiet)
-    if not quiet:
-        typer.echo(result.summary)
-    raise typer.Exit(EXIT_BY_VERDICT[result.registration.verdict.name])
-
-
-app.command()(benchmark)
-
-
 def main() -> None:
     """Run the command."""
     signal.signal(signal.SIGTERM, _interrupt)
-    app()
+    app(prog_name=NAME)
 
 
 def _interrupt(signum: int, frame: object) -> None:
     # a kill must leave as little behind as Ctrl-C does
     raise KeyboardInterrupt
-
-
-def _report(result: Registration, *, as_json: bool, verbose: bool, quiet: bool) -> None:
-    if as_json:
-        typer.echo(result.outputs["run"].read_text(encoding="utf-8"), nl=False)
-    elif not quiet:
-        from rich.console import Console
-
-        from mtpcr_geo.cli.summary import print_registration
-
-        print_registration(Console(highlight=False), result, verbose=verbose)
 
 
 if __name__ == "__main__":

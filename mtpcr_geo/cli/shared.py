@@ -1,23 +1,27 @@
-"""What the verbs of the command share: options, and progress bars."""
+"""What the verbs of the command share: progress bars, and how a verdict ends."""
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mtpcr_geo.cli import options
+from mtpcr_geo.cli.parameters import switch
+from mtpcr_geo.core.errors import EXIT_DOUBTFUL, EXIT_REFUSED, one_line
+
 if TYPE_CHECKING:
     from mtpcr_geo.core.progress import Progress
+    from mtpcr_geo.core.types import Verdict
 
-Verbose = Annotated[
-    bool, typer.Option("--verbose", "-v", help="Say what every stage did and how long it took.")
-]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the run as JSON on standard output.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that are already there.")]
+Quiet = Annotated[bool, switch(options.Quiet)]
+Overwrite = Annotated[bool, switch(options.Overwrite)]
+
+EXIT_BY_VERDICT = {"accepted": 0, "doubtful": EXIT_DOUBTFUL, "refused": EXIT_REFUSED}
 
 
 @contextmanager
@@ -32,3 +36,20 @@ def progress_bars(quiet: bool, always: bool = False) -> Iterator[Progress]:
 
     with RichProgress(Console(stderr=True, force_terminal=True if always else None)) as bars:
         yield bars
+
+
+def end_with(verdict: Verdict | None, *, quiet: bool) -> typer.Exit:
+    """Return the exit that a verdict calls for; with `quiet`, one line says why it is not accepted."""
+    if verdict is None:
+        return typer.Exit(0)
+    if quiet and verdict.name != "accepted":
+        reason = f": {verdict.reasons[0]}" if verdict.reasons else ""
+        typer.echo(one_line(f"mtpcr-geo: {verdict.name}{reason}"), err=True)
+    return typer.Exit(EXIT_BY_VERDICT[verdict.name])
+
+
+def json_text(value: Any) -> str:
+    """Return a value as indented strict JSON: arrays as lists, paths as text, what is not finite as null."""
+    from mtpcr_geo.export.run_json import plain
+
+    return json.dumps(plain(value), indent=2, allow_nan=False)

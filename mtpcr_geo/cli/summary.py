@@ -1,9 +1,10 @@
-"""What a run came to, in a few lines for a terminal."""
+"""What a run came to, in a few lines for a terminal: the verdict first, each fact once."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mtpcr_geo.core import transforms
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from mtpcr_geo.registration import Registration
 
 _COLOUR = {"accepted": "bold green", "doubtful": "bold yellow", "refused": "bold red"}
-# the numbers most worth a look; --verbose shows all
+# metrics of the verdict shown without --verbose
 _SHOWN = (
     "vertical_offset_m",
     "overlap_m2",
@@ -37,11 +38,22 @@ _OPEN_WITH = {
 }
 
 
-def print_registration(console: Console, result: Registration, *, verbose: bool = False) -> None:
-    """Print verdict, reasons, the transform in words, the checks, and which files to open."""
+def print_registration(
+    result: Registration, *, verbose: bool = False, files: bool = True, console: Console | None = None
+) -> None:
+    """Print verdict, reasons, the transform in words, the checks, and which files to open.
+
+    Args:
+        result: what a registration came to.
+        verbose: all metrics of the verdict; and, on standard error, the seconds of each stage.
+        files: name the files to open.
+        console: where to print; standard output if not given.
+
+    """
     from rich.table import Table
     from rich.text import Text
 
+    console = console or _stdout()
     name = result.verdict.name
     console.print(Text(name.upper(), _COLOUR[name]))
     for reason in result.verdict.reasons:
@@ -52,24 +64,39 @@ def print_registration(console: Console, result: Registration, *, verbose: bool 
     if facts.row_count:
         console.print(facts)
     if verbose:
-        _print_stages(console, result.report)
-    for what, path in result.outputs.items():
-        if what in _OPEN_WITH:
-            console.print(Text(f"  {path}"), Text(_OPEN_WITH[what], "dim"), soft_wrap=True)
+        _print_stages(result.report)
+    for path, what in _to_open(result).items() if files else ():
+        console.print(Text(f"  {path}"), Text(what, "dim"), soft_wrap=True)
     if name == "refused" and "registered" not in result.outputs:
         console.print(Text("  no registered cloud was written; --force writes it all the same", "dim"))
 
 
-def print_run(console: Console, result: RunResult, *, verbose: bool = False) -> None:
-    """Print what a pipeline came to: the registration if it holds one, else its files."""
+def print_run(result: RunResult, *, verbose: bool = False, console: Console | None = None) -> None:
+    """Print what a pipeline came to: the registration if it holds one, and every file it wrote, once."""
     from mtpcr_geo.registration import registration_of
 
+    console = console or _stdout()
+    named: set[Path] = set()
     if result.verdict is not None:
-        print_registration(console, registration_of(result), verbose=verbose)
+        registration = registration_of(result)
+        print_registration(registration, verbose=verbose, console=console)
+        named = set(_to_open(registration))
     elif verbose:
-        _print_stages(console, result.done)
+        _print_stages(result.done)
     for path in result.outputs:
-        console.print(f"  wrote {path}", soft_wrap=True, markup=False)
+        if path not in named:
+            console.print(f"  wrote {path}", soft_wrap=True, markup=False)
+
+
+def _stdout() -> Console:
+    from rich.console import Console
+
+    return Console(highlight=False)
+
+
+def _to_open(result: Registration) -> dict[Path, str]:
+    """Return the files worth opening, and what each is."""
+    return {path: _OPEN_WITH[key] for key, path in result.outputs.items() if key in _OPEN_WITH}
 
 
 def _transform_rows(result: Registration) -> list[tuple[str, str]]:
@@ -95,7 +122,12 @@ def _metric_rows(metrics: Mapping[str, Any], verbose: bool) -> list[tuple[str, s
     return metric_rows(metrics if verbose or not chosen else chosen)
 
 
-def _print_stages(console: Console, done: Sequence[Mapping[str, Any]]) -> None:
+def _print_stages(done: Sequence[Mapping[str, Any]]) -> None:
+    """Print the seconds of each stage, on standard error."""
+    from rich.console import Console
+
+    talk = Console(stderr=True, highlight=False)
     for entry in done:
         note = entry.get("skipped") or entry.get("failed") or ""
-        console.print(f"  {entry['seconds']:8.2f} s  {entry['tag']} ({entry['type']}) {note}", soft_wrap=True)
+        text = f"  {entry['seconds']:8.2f} s  {entry['tag']} ({entry['type']}) {note}".rstrip()
+        talk.print(text, soft_wrap=True, markup=False)

@@ -21,6 +21,13 @@ code  meaning
 
 EXIT_DOUBTFUL = 3
 EXIT_REFUSED = 4
+EXIT_INTERRUPTED = 130
+
+
+def one_line(text: str) -> str:
+    """Return a message in one line, with control characters written as escapes."""
+    line = " ".join(text.split())
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in line)
 
 
 class MtpcrError(Exception):

@@ -1,4 +1,4 @@
-"""Where long work says how far it is: bars on a terminal, or nothing."""
+"""Progress of long work: bars on a terminal, or nothing."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class Progress(Protocol):
 
 
 class NoProgress:
-    """Says nothing."""
+    """Reports nothing."""
 
     @contextmanager
     def task(self, what: str, total: int | None = None) -> Iterator[Advance]:
-        """Open a task that nobody hears of."""
+        """Open a task that is not shown."""
         yield lambda count: None
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
 import sys
 from importlib import metadata
+from pathlib import Path
 
 from mtpcr_geo.core.version import __version__
 
@@ -23,6 +25,12 @@ def versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             continue
     return found
+
+
+def sha256(path: str | Path) -> str:
+    """Return the SHA-256 of a file's content, as 64 hexadecimal digits."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def peak_memory_mb() -> float | None:

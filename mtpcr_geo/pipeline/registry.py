@@ -8,10 +8,11 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.suggestions import meant
+from mtpcr_geo.pipeline.options import first_problem as first_problem
 from mtpcr_geo.pipeline.stage import Stage, StageOptions
 
 _MODULES = ("io", "rasters", "matching", "solving", "export", "register")
@@ -51,26 +52,3 @@ def make_options(label: str, model: type[StageOptions], words: Mapping[str, Any]
         return model.model_validate(words)
     except ValidationError as error:
         raise OptionError(f"{label}: {first_problem(error, model)}") from None
-
-
-def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
-    """Put what is wrong with options in one line: the first thing, with the nearest valid word."""
-    # a misspelt key often causes a missing one too, and says more
-    problems = sorted(
-        error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden"
-    )
-    problem = problems[0]
-    name = ".".join(str(part) for part in problem["loc"]) or "options"
-    names = [field.alias or key for key, field in model.model_fields.items()]
-    if problem["type"] == "extra_forbidden":
-        return f"no option {name!r}{meant(name, names)}"
-    if problem["type"] == "missing":
-        return f"the option {name!r} is missing"
-    message = problem["msg"].removeprefix("Value error, ")
-    message = message[:1].lower() + message[1:]
-    return f"option {name!r}: {message}, got {_short(problem['input'])}"
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

@@ -215,7 +215,7 @@ def _turn(stage: Stage, inputs: Sequence[Value | None], context: RunContext) -> 
 
 
 def _input_facts(stages: Mapping[str, Stage]) -> list[dict[str, Any]]:
-    from mtpcr_geo.io.las import sha256
+    from mtpcr_geo.core.system import sha256
 
     paths = dict.fromkeys(path for stage in stages.values() for path in stage.reads() if path.is_file())
     return [{"path": str(path), "bytes": path.stat().st_size, "sha256": sha256(path)} for path in paths]

@@ -40,23 +40,45 @@ def one_line(result) -> str:
     return lines[0]
 
 
-@pytest.mark.parametrize("arguments", [["-c", "import mtpcr_geo"], ["-m", "mtpcr_geo.cli.app", "--help"]])
-def test_starting_loads_nothing_heavy(arguments):
-    code = (
-        "import sys\n"
-        f"sys.argv = {['mtpcr-geo', *arguments[2:]]!r}\n"
-        "try:\n"
-        f"    {'import mtpcr_geo' if arguments[0] == '-c' else 'import mtpcr_geo.cli.app as c; c.main()'}\n"
-        "except SystemExit:\n    pass\n"
-        f"print(sorted({HEAVY!r} & set(sys.modules)))"
-    )
+def loaded_by(code: str) -> set[str]:
+    """Return the modules that a fresh interpreter has loaded after some code."""
+    code = f"import sys\ntry:\n    {code}\nexcept SystemExit:\n    pass\nprint('\\n' + ' '.join(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "[]"
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def calling(*arguments: str) -> str:
+    return f"sys.argv = {['mtpcr-geo', *arguments]!r}; import mtpcr_geo.cli.app as c; c.main()"
+
+
+@pytest.mark.parametrize("code", ["import mtpcr_geo", calling("--help"), calling("--version"), calling()])
+def test_starting_loads_nothing_heavy(code):
+    loaded = loaded_by(code)
+    assert not HEAVY & loaded
+    # nor any room but the command's own
+    rooms = {name.split(".")[1] for name in loaded if name.startswith("mtpcr_geo.")}
+    assert rooms <= {"cli", "core"}
+
+
+@pytest.mark.parametrize("verb", ["register", "check", "apply", "pipeline", "models", "demo"])
+def test_the_help_of_a_verb_loads_only_option_models(verb):
+    loaded = loaded_by(calling(verb, "--help"))
+    assert (HEAVY - {"pydantic"}) & loaded == set()
+    rooms = {name.split(".")[1] for name in loaded if name.startswith("mtpcr_geo.")}
+    assert rooms <= {"cli", "core", "pipeline"}
+    assert not any(name.startswith("mtpcr_geo.benchmark") for name in loaded)
 
 
 def test_help_names_every_verb():
     text = run("--help").stdout
-    assert all(verb in text for verb in ("register", "apply", "demo", "pipeline"))
+    for verb in ("register", "check", "apply", "pipeline", "models", "demo", "benchmark"):
+        assert f"  {verb} " in text
+
+
+def test_without_arguments_the_help_is_shown_on_standard_error():
+    result = run()
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "register" in result.stderr
 
 
 def test_version():
@@ -109,8 +131,9 @@ def test_exit_code_says_the_verdict(verdict, code, town_files, tmp_path, monkeyp
     assert (out / "registered.laz").exists() == (verdict == "doubtful")
     assert (out / "transform.json").exists() == (verdict == "doubtful")
     assert (out / "run.json").exists()
-    forced = run("register", *town_files, "-o", out, "--no-recording", "--force", "--overwrite")
-    assert forced.exit_code == code
+    forced = run("register", *town_files, "-o", out, "--no-recording", "--force", "--overwrite", "-q")
+    assert (forced.exit_code, forced.stdout) == (code, "")
+    assert one_line(forced) == f"mtpcr-geo: {verdict}: because"
     assert (out / "registered.laz").exists()
 
 
@@ -189,7 +212,49 @@ def test_pipeline_writes_metadata_and_takes_overrides(town_files, tmp_path, monk
     metadata = json.loads(Path("m.json").read_text())
     assert metadata["metadata"]["readers.las"]["count"] == 50
     assert set(metadata["stages"]) == {"readers_las1", "writers_las1"}
-    assert "copy.laz" in result.stdout
+    # results on standard output, talk on standard error; each file once
+    assert result.stdout.count("copy.laz") == 1
+    assert "readers_las1 (readers.las)" in result.stderr
+    assert "readers.las" not in result.stdout
+
+
+def test_the_pipeline_may_stand_behind_its_overrides(town_files, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("p.json").write_text(json.dumps([{"type": "readers.las", "filename": "x"}, "copy.laz"]))
+    before = f"--readers.las.filename={town_files[1]}"
+    result = run("pipeline", before, "--readers.las.count", 20, "p.json", "-q")
+    assert (result.exit_code, result.output) == (0, "")
+    assert len(laspy.read("copy.laz")) == 20
+
+
+def test_a_registering_pipeline_names_each_file_once(town_files, tmp_path):
+    dumped = run("register", *town_files, "-o", tmp_path, "--no-recording", "--dump-pipeline").stdout
+    result = run("pipeline", "-", stdin=dumped.encode())
+    assert result.exit_code == 0
+    lines = result.stdout.splitlines()
+    assert lines[0] == "ACCEPTED"
+    written = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert written
+    for path in written:
+        # target.tif is within bev_target.tif's line alone: names are compared whole
+        assert sum(str(path) in line.split() for line in lines) == 1, path
+
+
+def test_colours_only_where_they_are_wanted(town_files, tmp_path, monkeypatch):
+    words = ("register", *town_files, "--no-recording", "--overwrite", "-v", "-o", tmp_path)
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    assert "\x1b[1;32m" in run(*words).stdout
+    monkeypatch.setenv("NO_COLOR", "1")
+    plain = run(*words)
+    assert "\x1b[1;32m" not in plain.stdout
+    assert "ACCEPTED" in plain.stdout
+    assert "mtpcr.match" in plain.stderr
+
+
+def test_errors_show_no_control_characters(tmp_path):
+    result = run("apply", tmp_path / "a\x1b[31mred.json", "a.laz", "b.laz")
+    assert result.exit_code == 5
+    assert "a\\x1b[31mred.json" in one_line(result)
 
 
 def test_schema_is_a_schema_that_ready_pipelines_fit():

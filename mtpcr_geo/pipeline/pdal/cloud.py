@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 from mtpcr_geo.core.errors import InputError
+from mtpcr_geo.io.dimensions import separate_legacy_flags
 from mtpcr_geo.io.las import LasCloud
 from mtpcr_geo.io.views import Moved, xyz_of
 from mtpcr_geo.io.write import write_cloud
@@ -92,7 +93,14 @@ class PdalCloud(Cloud):
         for records in self._held if self._held is not None else self._stream(self._again, size):
             for start in range(0, len(records), size):
                 part = records[start : start + size]
-                yield {name: part[name] for name in part.dtype.names or ()}
+                table = {name: part[name] for name in part.dtype.names or ()}
+                yield separate_legacy_flags(table) if self._reads_las_alone else table
+
+    @property
+    def _reads_las_alone(self) -> bool:
+        """Return whether all points are from LAS files: PDAL before 2.6 leaves flags in their class byte."""
+        readers = [stage for stage in self._steps if stage.is_reader]
+        return bool(readers) and all(stage.spec.type == "readers.las" for stage in readers)
 
     def _words(self, context: RunContext) -> list[dict[str, Any]]:
         """Put the chain in PDAL's JSON, without the writers that have written already."""

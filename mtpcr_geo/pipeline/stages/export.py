@@ -14,6 +14,7 @@ from mtpcr_geo.core.recorder import NullRecorder
 from mtpcr_geo.core.system import peak_memory_mb
 from mtpcr_geo.core.types import Pair, Side, Verdict
 from mtpcr_geo.crs.chain import TransformChain
+from mtpcr_geo.pipeline.options import Force
 from mtpcr_geo.pipeline.stage import RunContext, Stage, StageOptions, Value
 
 TransformFormat = Literal["json", "cloudcompare", "pdal"]
@@ -22,7 +23,7 @@ TransformFormat = Literal["json", "cloudcompare", "pdal"]
 class ApplyOptions(StageOptions):
     """Options of mtpcr.apply."""
 
-    force: bool = Field(False, description="hand on the moved cloud though the verdict refuses it")
+    force: Force = False
 
 
 class Apply(Stage):
@@ -40,7 +41,7 @@ class Apply(Stage):
         if pair.T_target_source is None:
             raise OptionError(f"{self.label} needs a solved pair; put mtpcr.solve before it")
         if refused(pair) and not (self.options.force or context.force):
-            self.metadata["held_out"] = "the verdict is refused"
+            self.metadata["skipped"] = "the verdict is refused"
             return None
         return Moved(pair)
 
@@ -158,7 +159,7 @@ class WriteTransform(EvidenceWriter):
             description="json for mtpcr-geo apply, a cloudcompare matrix, or a pdal pipeline; "
             "where not given, .pdal.json means pdal, .txt means cloudcompare, all else json",
         )
-        force: bool = Field(False, description="write it though the verdict refuses it")
+        force: Force = False
 
     def missing(self, pair: Pair, context: RunContext) -> str | None:
         """Need a transform that was not refused."""

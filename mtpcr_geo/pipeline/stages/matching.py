@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
@@ -13,6 +12,7 @@ from pydantic import Field
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.types import Appearance, Bev, Look, Pair, Side
+from mtpcr_geo.pipeline.options import MatcherName, Models, PriorKind, PriorSigma, PriorYaw, Seed
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 from mtpcr_geo.pipeline.stages.solving import bevs_of, georeference
 
@@ -71,26 +71,15 @@ class Enhance(Stage):
 class MatchOptions(StageOptions):
     """Options of mtpcr.match."""
 
-    method: str = Field(
-        "correlation",
-        description="which matcher: correlation (needs no keypoints), rootsift, orb, or a learned one by the "
-        "name of its description: xfeat, aliked, superpoint, superpoint_lightglue_fused, "
-        "disk_lightglue_fused, or one of your own in the models folder",
-    )
+    method: MatcherName = "correlation"
     yaw_step: float = Field(4.0, gt=0, le=30, description="step of the search over all yaws, degrees")
     patch: float = Field(24.0, gt=0, description="edge of a patch of the local matches, metres")
     search_radius: float = Field(6.0, gt=0, description="how far a patch may lie from the hypothesis, metres")
     min_overlap: float = Field(400.0, ge=0, description="smallest overlap considered, square metres")
-    prior: Literal["none", "georef"] = Field(
-        "none", description="georef starts from where both clouds' CRSs put them, and searches only near it"
-    )
-    prior_sigma: float = Field(
-        5.0, gt=0, description="standard deviation of the source's place under the prior, metres"
-    )
-    prior_yaw: float = Field(5.0, gt=0, le=180, description="largest turn from the prior considered, degrees")
-    models: Path | None = Field(
-        None, description="folder of model files; the environment variable MTPCR_GEO_MODELS if not given"
-    )
+    prior: PriorKind = "none"
+    prior_sigma: PriorSigma = 5.0
+    prior_yaw: PriorYaw = 5.0
+    models: Models = None
     turns: int = Field(
         8, ge=1, le=72, description="orientations in which learned matchers are tried, round the circle"
     )
@@ -124,7 +113,7 @@ class MatchOptions(StageOptions):
     threads: int = Field(
         0, ge=0, description="threads of learned matchers on the processor; 0 takes all cores"
     )
-    seed: int = Field(0, ge=0, description="seed of the random choices")
+    seed: Seed = 0
 
 
 class Match(Stage):
@@ -233,7 +222,7 @@ class FocusOptions(StageOptions):
     finer: float = Field(2.0, ge=1, le=16, description="by which the cells are divided")
     radius: float = Field(25.0, gt=0, description="of the neighbourhood of a match, metres")
     finest: float = Field(0.25, gt=0, description="cells are made no finer than this, metres")
-    seed: int = Field(0, ge=0, description="seed of the random choices")
+    seed: Seed = 0
 
 
 class Focus(Stage):

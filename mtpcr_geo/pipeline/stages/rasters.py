@@ -24,6 +24,7 @@ from mtpcr_geo.method.bev import (
     make_bev,
     rasterise,
 )
+from mtpcr_geo.pipeline.options import Cell, LevelMethod, Local, OutCrs, Seed, SourceCrs, TargetCrs, Vertical
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 
 if TYPE_CHECKING:
@@ -33,29 +34,16 @@ if TYPE_CHECKING:
 class LevelOptions(StageOptions):
     """Options of mtpcr.level."""
 
-    method: Literal["auto", "ransac", "none"] = Field(
-        "auto",
-        description="how to make clouds upright: auto trusts the vertical of a georeferenced cloud and "
-        "levels a local one by ground and vertical structure; ransac turns the ground plane horizontal; "
-        "none keeps them",
-    )
-    target_crs: str | None = Field(
-        None, description="CRS of the first cloud instead of what it states, or local"
-    )
-    source_crs: str | None = Field(
-        None, description="CRS of the second cloud instead of what it states, or local"
-    )
-    local: bool = Field(False, description="all clouds are local, in metres, whatever they state")
-    vertical: Literal["refuse", "assume-same", "estimate"] = Field(
-        "refuse",
-        description="what to do with different or unknown vertical datums: refuse them, take them as the "
-        "same, or take heights as they are and leave the offset to the registration",
-    )
-    out_crs: str | None = Field(None, description="CRS of the result, where it shall not be the target's")
+    method: LevelMethod = "auto"
+    target_crs: TargetCrs = None
+    source_crs: SourceCrs = None
+    local: Local = False
+    vertical: Vertical = "refuse"
+    out_crs: OutCrs = None
     budget: int = Field(
         4_000_000, ge=1000, description="points of each cloud to work on; rasters always use all points"
     )
-    seed: int = Field(0, ge=0, description="seed of the random choices")
+    seed: Seed = 0
 
 
 class Level(Stage):
@@ -113,7 +101,7 @@ class Level(Stage):
         roles: tuple[Literal["target", "source"], ...] = ("target", "source")
         for role, cloud, link, scanned in zip(roles, clouds, links, found, strict=False):
             sample = in_work_frame(link, scanned.sample)
-            levelling = level(sample, options.method, link.file_crs is not None, options.seed)
+            levelling = level(sample, options.method, link.georeferenced, options.seed)
             self.metadata[role] = {
                 "points": scanned.count,
                 "noise_points": scanned.dropped,
@@ -136,12 +124,7 @@ def in_work_frame(link: FrameLink, xyz: Floats) -> Floats:
 class BevOptions(StageOptions):
     """Options of mtpcr.bev."""
 
-    cell: float | None = Field(
-        None,
-        gt=0,
-        allow_inf_nan=False,
-        description="edge of a raster cell in metres; chosen from both clouds' densities if not given",
-    )
+    cell: Cell = None
     finest: float = Field(
         1.0, ge=0.25, le=8, allow_inf_nan=False, description="no finer cell is chosen than this, metres"
     )

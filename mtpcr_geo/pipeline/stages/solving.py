@@ -13,6 +13,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.types import Bev, Pair, SolveSettings
+from mtpcr_geo.pipeline.options import Motion, Seed
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 
 
@@ -23,7 +24,7 @@ def georeference(pair: Pair, label: str) -> Floats:
         OptionError: if a cloud has no CRS to claim it by.
 
     """
-    if pair.frame.crs is None or pair.source.link.file_crs is None:
+    if not (pair.target.link.georeferenced and pair.source.link.georeferenced):
         raise OptionError(
             f"{label}: a prior from the georeference needs a CRS on both clouds; name it by --source-crs and "
             "--target-crs, or search without a prior"
@@ -67,7 +68,7 @@ class InverseMappingOptions(StageOptions):
     block: float = Field(
         40.0, gt=0, description="edge of the blocks in which tie points are held out, metres"
     )
-    seed: int = Field(0, ge=0, description="seed that chooses the held out blocks")
+    seed: Seed = 0
 
 
 class InverseMapping(Stage):
@@ -118,7 +119,7 @@ class SolveOptions(StageOptions):
         ge=1,
         description="pairs of tie points tried for the robust start; more where few of them are right",
     )
-    seed: int = Field(0, ge=0, description="seed of the robust start")
+    seed: Seed = 0
 
 
 class Solve(Stage):
@@ -166,9 +167,7 @@ class RefineOptions(StageOptions):
         description="points of the source after thinning; the target may have three times as many",
     )
     iterations: int = Field(30, ge=1, description="iterations of each round at most")
-    motion: Literal["rigid", "yaw", "translation"] = Field(
-        "rigid", description="degrees of freedom of the result: all six, yaw and shift, or the shift alone"
-    )
+    motion: Motion = "rigid"
     ground: bool = Field(True, description="settle height and tilt on the ground before, and height after")
     keep_tie_points: float = Field(
         0.5,

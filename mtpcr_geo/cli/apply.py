@@ -1,0 +1,35 @@
+"""The verb ``apply``."""
+
+from __future__ import annotations
+
+import typer
+
+from mtpcr_geo.cli.options import ApplyVerb
+from mtpcr_geo.cli.parameters import command_of
+from mtpcr_geo.cli.shared import progress_bars
+
+
+def run(options: ApplyVerb) -> None:
+    """Move a cloud by the transform of a registration, streamed.
+
+    Examples:
+        mtpcr-geo apply out/transform.json another_scan.laz moved.laz
+        mtpcr-geo apply out/transform.json moved.laz back.laz --inverse
+
+    """
+    from mtpcr_geo.export.apply import apply_transform
+
+    with progress_bars(options.quiet) as progress:
+        written = apply_transform(
+            options.transform,
+            options.cloud,
+            options.out,
+            inverse=options.inverse,
+            overwrite=options.overwrite,
+            progress=progress,
+        )
+    if not options.quiet:
+        typer.echo(f"wrote {written}")
+
+
+command = command_of(ApplyVerb, run)

@@ -1,0 +1,39 @@
+"""The verb ``check``."""
+
+from __future__ import annotations
+
+import typer
+
+from mtpcr_geo.cli.options import CheckVerb
+from mtpcr_geo.cli.parameters import command_of
+from mtpcr_geo.cli.shared import progress_bars
+
+
+def run(options: CheckVerb) -> None:
+    """Report what one or two clouds are and what is wrong with them, before they are registered.
+
+    Exit code 0: register would go on; else the code with which it would end.
+
+    Examples:
+        mtpcr-geo check ground.laz aerial.laz
+        mtpcr-geo check scan.laz --json
+
+    """
+    from mtpcr_geo.check import check_clouds
+    from mtpcr_geo.check.show import show
+
+    with progress_bars(options.quiet) as progress:
+        report = check_clouds(
+            options.source,
+            options.target,
+            source_crs=options.source_crs,
+            target_crs=options.target_crs,
+            local=options.local,
+            vertical=options.vertical,
+            progress=progress,
+        )
+    show(report, as_json=options.as_json, quiet=options.quiet)
+    raise typer.Exit(report.exit_code)
+
+
+command = command_of(CheckVerb, run)

@@ -1,0 +1,165 @@
+"""The options of each verb: those of the registration, and what only the command takes.
+
+A field is a parameter of the verb (`mtpcr_geo.cli.parameters`): its type, default, limits and description
+are declared in `mtpcr_geo.pipeline.options`, or here where nothing but the command has it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from mtpcr_geo.pipeline.options import (
+    INPUTS,
+    OUTPUT,
+    PRIOR,
+    RUN,
+    Local,
+    Models,
+    Overwrite,
+    RegisterOptions,
+    Shown,
+    SourceCrs,
+    TargetCrs,
+    Vertical,
+)
+
+AsJson = Annotated[
+    bool, Field(description="print the result as JSON on standard output"), Shown(OUTPUT, ("--json",))
+]
+Verbose = Annotated[
+    bool,
+    Field(description="all numbers of the verdict; on standard error, what each stage took"),
+    Shown(OUTPUT, ("--verbose", "-v")),
+]
+Quiet = Annotated[bool, Field(description="print nothing but errors"), Shown(OUTPUT, ("--quiet", "-q"))]
+QuietVerdict = Annotated[
+    bool,
+    Field(description="print nothing but errors, and one line where the verdict is not accepted"),
+    Shown(OUTPUT, ("--quiet", "-q")),
+]
+
+
+class VerbOptions(BaseModel):
+    """Base of the options of a verb."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RegisterVerb(RegisterOptions):
+    """Options of ``register``."""
+
+    source: Annotated[
+        Path, Field(description="cloud that moves: LAS, LAZ or COPC"), Shown(INPUTS, argument=True)
+    ]
+    target: Annotated[
+        Path, Field(description="cloud that stays: LAS, LAZ or COPC"), Shown(INPUTS, argument=True)
+    ]
+    out: Annotated[
+        Path,
+        Field(description="folder for the result and its evidence; made if it is not there"),
+        Shown(OUTPUT, ("--out", "-o")),
+    ]
+    no_prior: Annotated[
+        bool, Field(description="search everywhere, whatever --prior says (the default)"), Shown(PRIOR)
+    ] = False
+    dump_pipeline: Annotated[
+        bool, Field(description="print the run as pipeline JSON, and do not run it"), Shown(OUTPUT)
+    ] = False
+    as_json: AsJson = False
+    verbose: Verbose = False
+    quiet: QuietVerdict = False
+
+
+class PipelineVerb(VerbOptions):
+    """Options of ``pipeline``."""
+
+    file: Annotated[
+        Path | None,
+        Field(description="pipeline JSON; - reads standard input"),
+        Shown(INPUTS, argument=True),
+    ] = None
+    more: tuple[str, ...] = ()
+    only_validate: Annotated[
+        bool,
+        Field(description="check grammar, options, files and CRS; run nothing"),
+        Shown(RUN, ("--validate",)),
+    ] = False
+    allow_code: Annotated[
+        bool, Field(description="let stages such as filters.python run code"), Shown(RUN)
+    ] = False
+    allow_network: Annotated[
+        bool, Field(description="let stages read remote or virtual (/vsi) files"), Shown(RUN)
+    ] = False
+    metadata: Annotated[
+        Path | None, Field(description="JSON file to write what the stages report to"), Shown(OUTPUT)
+    ] = None
+    progress: Annotated[
+        bool,
+        Field(description="show progress bars even where standard error is no terminal"),
+        Shown(OUTPUT),
+    ] = False
+    print_schema: Annotated[
+        bool,
+        Field(description="print the JSON Schema of pipelines, for editors, and run nothing"),
+        Shown(OUTPUT, ("--schema",)),
+    ] = False
+    overwrite: Overwrite = False
+    as_json: AsJson = False
+    verbose: Verbose = False
+    quiet: QuietVerdict = False
+
+
+class ApplyVerb(VerbOptions):
+    """Options of ``apply``."""
+
+    transform: Annotated[
+        Path, Field(description="the transform.json of a registration"), Shown(INPUTS, argument=True)
+    ]
+    cloud: Annotated[
+        Path,
+        Field(description="cloud to move: LAS, LAZ or COPC, in the frame of the source"),
+        Shown(INPUTS, argument=True),
+    ]
+    out: Annotated[Path, Field(description="file to write: .las or .laz"), Shown(OUTPUT, argument=True)]
+    inverse: Annotated[
+        bool, Field(description="move from the target's frame to the source's instead"), Shown(RUN)
+    ] = False
+    overwrite: Overwrite = False
+    quiet: Quiet = False
+
+
+class CheckVerb(VerbOptions):
+    """Options of ``check``."""
+
+    source: Annotated[
+        Path, Field(description="cloud that would move, or the only one"), Shown(INPUTS, argument=True)
+    ]
+    target: Annotated[
+        Path | None, Field(description="cloud that would stay"), Shown(INPUTS, argument=True)
+    ] = None
+    source_crs: SourceCrs = None
+    target_crs: TargetCrs = None
+    local: Local = False
+    vertical: Vertical = "refuse"
+    as_json: AsJson = False
+    quiet: Quiet = False
+
+
+class ModelsVerb(VerbOptions):
+    """Options of ``models``."""
+
+    models: Models = None
+    as_json: AsJson = False
+
+
+class DemoVerb(VerbOptions):
+    """Options of ``demo``."""
+
+    out: Annotated[
+        Path, Field(description="folder for the demonstration's files"), Shown(OUTPUT, ("--out", "-o"))
+    ] = Path("mtpcr-demo")
+    overwrite: Overwrite = False
+    quiet: QuietVerdict = False

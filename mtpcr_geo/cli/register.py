@@ -1,0 +1,44 @@
+"""The verb ``register``."""
+
+from __future__ import annotations
+
+import typer
+
+from mtpcr_geo.cli.options import RegisterVerb
+from mtpcr_geo.cli.parameters import command_of
+from mtpcr_geo.cli.shared import end_with, progress_bars
+from mtpcr_geo.pipeline.options import RegisterOptions
+
+
+def run(options: RegisterVerb) -> None:
+    """Bring SOURCE to TARGET; write the registered cloud, its transform and the evidence to a folder.
+
+    Exit code 0: accepted; 3: doubtful; 4: refused, evidence only; 2: an option is wrong; 5: an input cannot
+    be used; 6: the CRSs do not allow it; 7: an output cannot be written; 8: an optional part is missing.
+
+    Examples:
+        mtpcr-geo register ground.laz aerial.laz -o out
+        mtpcr-geo register scan.laz tile.laz -o out --source-crs local --overwrite
+        mtpcr-geo register ground.laz aerial.laz -o out --dump-pipeline > mine.json
+
+    """
+    from mtpcr_geo.cli.summary import print_registration
+    from mtpcr_geo.pipeline.grammar import dump
+    from mtpcr_geo.registration import build_pipeline, read_options, register
+
+    given = {name: getattr(options, name) for name in RegisterOptions.model_fields}
+    if options.no_prior:
+        given["prior"] = "none"
+    if options.dump_pipeline:
+        typer.echo(dump(build_pipeline(options.source, options.target, options.out, read_options(given))))
+        return
+    with progress_bars(options.quiet) as progress:
+        result = register(options.source, options.target, options.out, progress=progress, **given)
+    if options.as_json:
+        typer.echo(result.outputs["run"].read_text(encoding="utf-8"), nl=False)
+    elif not options.quiet:
+        print_registration(result, verbose=options.verbose)
+    raise end_with(result.verdict, quiet=options.quiet)
+
+
+command = command_of(RegisterVerb, run)
