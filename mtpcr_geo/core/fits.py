@@ -150,6 +150,8 @@ class IcpResult(ComparesArrays):
         lost_tie_points: whether a run whose surfaces met better was not followed, since it lost tie points.
         rounds: rounds of the run that was followed.
         rotated_deg: angle by which it turned the start, degrees; None where none was followed.
+        fine: the last round at a finer thinning, where the density bears one.
+        fine_voxel_m: that thinning, metres.
 
     """
 
@@ -164,12 +166,16 @@ class IcpResult(ComparesArrays):
     lost_tie_points: bool
     rounds: tuple[IcpRound, ...] = ()
     rotated_deg: float | None = None
+    fine: IcpRound | None = None
+    fine_voxel_m: float | None = None
 
     def audit(self) -> dict[str, Any]:
         """Return the figures of the runs, for the audit."""
         rounds: dict[str, Any] = {}
         if self.rotated_deg is not None:
             rounds = {"rounds": [vars(one) for one in self.rounds], "rotated_deg": self.rotated_deg}
+        if self.fine is not None:
+            rounds["fine"] = {"voxel_m": self.fine_voxel_m, **vars(self.fine)}
         return {
             "method": self.method,
             "voxel_m": self.voxel_m,

@@ -10,9 +10,10 @@ import numpy as np
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
-from mtpcr_geo.core.types import GroundFit, IcpMethod, IcpResult, IcpTrial, Refinement
+from mtpcr_geo.core.types import GroundFit, IcpMethod, IcpResult, IcpRound, IcpTrial, Refinement
 from mtpcr_geo.method.icp import Rounds, Surfaces, rounds_for
-from mtpcr_geo.method.overlap import Overlap, overlap_of
+from mtpcr_geo.method.overlap import OVERLAP_CELL_M, Overlap, overlap_of
+from mtpcr_geo.method.scales import ground_cell_for
 
 Motion = Literal["rigid", "yaw", "translation"]
 
@@ -21,6 +22,13 @@ CORRELATED_CELLS = 50
 GROUND_NOISE_M = 0.5
 LEVEL_SIGMA_DEG = 1.0
 SCATTER_SHARE, SCATTER_M = 0.5, 0.03
+FINE_SPACINGS = 2.0
+"""Voxel of the last round in mean distances between points of the sparser cloud."""
+FINEST_VOXEL_M = 0.1
+FINE_BELOW = 0.75
+"""Share of the thinning before below which a last, finer round is worth its time."""
+FINE_DISTANCE_VOXELS = 2.0
+FINE_POINTS = 2
 CLEARLY = 1.01
 """Times that the residual after ICP must exceed a start's for the start to be taken: on bare, sparse ground
 they are equal but for chance, and results would jump with it."""
@@ -83,8 +91,9 @@ def refine(
     """
     T, ground_before, icp, ground_after = T_start, None, None, None
     starts = {"tie_points": T}
+    ground_cell = ground_cell_for(cell)
     if settings.ground:
-        ground_before = settle_on_ground(source, target, T, tilt=True)
+        ground_before = settle_on_ground(source, target, T, tilt=True, cell=ground_cell)
         T = starts["ground"] = ground_before.T
     if settings.method is not None:
         asked = settings.max_correspondence_distances_m
@@ -109,14 +118,72 @@ def refine(
             iterations=settings.iterations,
         )
         T = icp.T
+        fine = _refined_finely(source, target, T, settings, agreeing) if icp.followed else None
+        if fine is not None:
+            icp = replace(icp, T=fine.T, fine=fine.round_, fine_voxel_m=fine.voxel_m)
+            T = fine.T
     if settings.ground:
-        ground_after = settle_on_ground(source, target, T, tilt=False)
+        ground_after = settle_on_ground(source, target, T, tilt=False, cell=ground_cell)
         ground_after = replace(ground_after, followed=settings.method is None or beyond_scatter(ground_after))
         T = ground_after.T if ground_after.followed else T
     if settings.motion != "rigid":
         middle = source.mean(axis=0) if pivot is None else pivot
         T = constrain(T, settings.motion, middle, np.eye(3) if R_upright is None else R_upright)
     return Refinement(T, T_start, ground_before, icp, ground_after)
+
+
+@dataclass(frozen=True)
+class _Fine:
+    T: Floats
+    round_: IcpRound
+    voxel_m: float
+
+
+def _refined_finely(
+    source: Floats,
+    target: Floats,
+    T_start: Floats,
+    settings: RefineSettings,
+    agreeing: Callable[[Floats], int],
+) -> _Fine | None:
+    """Run a last round of ICP as fine as the density allows; None where that brings nothing.
+
+    It is taken only where surfaces seen at the fine thinning meet better by it, and the tie points are kept.
+    """
+    voxel = fine_voxel(source, target, T_start)
+    if settings.method is None or voxel > FINE_BELOW * settings.voxel_m:
+        return None
+    distance = FINE_DISTANCE_VOXELS * voxel
+    surfaces = Surfaces(
+        source,
+        target,
+        T_start,
+        voxel_m=voxel,
+        max_correspondence_distance_m=distance,
+        max_points=FINE_POINTS * settings.max_points,
+    )
+    run = surfaces.descend(
+        T_start, Rounds((distance,)), method=settings.method, iterations=settings.iterations
+    )
+    if surfaces.surface_residual(run.T) >= surfaces.surface_residual(T_start):
+        return None
+    if agreeing(run.T) < settings.keep_tie_points * agreeing(T_start):
+        return None
+    return _Fine(run.T, run.rounds[-1], voxel)
+
+
+def fine_voxel(source: Floats, target: Floats, T: Floats) -> float:
+    """Return the thinning that the sparser cloud's density in the overlap bears, metres.
+
+    Args:
+        source, target: (n, 3) and (m, 3) work coordinates, metres.
+        T: 4x4 from source to target.
+
+    """
+    overlap = overlap_of(transforms.apply(T, source), target)
+    area = max(float(overlap.shared.sum()) * overlap.grid.cell**2, 1.0)
+    counts = [float(bev.count[overlap.shared].sum()) for bev in (overlap.source, overlap.target)]
+    return float(np.clip(FINE_SPACINGS / np.sqrt(max(min(counts), 1.0) / area), FINEST_VOXEL_M, np.inf))
 
 
 def follow_icp(
@@ -185,7 +252,13 @@ def follow_icp(
 
 
 def settle_on_ground(
-    source: Floats, target: Floats, T_start: Floats, *, tilt: bool, overlap: Overlap | None = None
+    source: Floats,
+    target: Floats,
+    T_start: Floats,
+    *,
+    tilt: bool,
+    overlap: Overlap | None = None,
+    cell: float = OVERLAP_CELL_M,
 ) -> GroundFit:
     """Correct the height, and if wanted the tilt, so that both clouds' ground agrees.
 
@@ -197,10 +270,11 @@ def settle_on_ground(
         T_start: 4x4 from source to target.
         tilt: whether to correct the tilt too, where the ground extends far enough to tell it.
         overlap: both clouds on one grid under ``T_start``, if at hand.
+        cell: in which the ground is compared, metres, where the overlap is not at hand.
 
     """
     if overlap is None:
-        overlap = overlap_of(transforms.apply(T_start, source), target)
+        overlap = overlap_of(transforms.apply(T_start, source), target, cell)
     xy, step = overlap.ground_steps()
     if len(step) < FEWEST_GROUND_CELLS:
         return GroundFit(T_start, len(step))

@@ -67,7 +67,7 @@ class Scales:
     @property
     def tolerance_m(self) -> float:
         """Plan distance within which a match agrees with a pose, metres: the rasters resolve no better."""
-        return max(self.cell_m, MIN_TOLERANCE_M)
+        return tolerance_for(self.cell_m)
 
 
 def occupied_area(bev: Bev) -> float:
@@ -107,6 +107,11 @@ def block_for(xy: np.ndarray, cell: float) -> float:
         return MAX_BLOCK_M
     spans = np.percentile(xy, 95, axis=0) - np.percentile(xy, 5, axis=0)
     return float(np.clip(np.sqrt(max(np.prod(spans), 0.0)) / BLOCKS_PER_EXTENT, cell, MAX_BLOCK_M))
+
+
+def tolerance_for(cell: float) -> float:
+    """Return the plan distance within which a match agrees with a pose, metres: rasters resolve no better."""
+    return max(cell, MIN_TOLERANCE_M)
 
 
 def ground_cell_for(cell: float) -> float:

@@ -40,7 +40,10 @@ class Evidence:
         held_out_median_m: median plan residual of the agreeing held-out tie points, metres.
         margin: strength of the best hypothesis over the next distinct one; None where the matcher gives none.
         support: share of the patches in the overlap that agree on the pose; None likewise.
+        null_ratio: strength of the best hypothesis over the best that the mirrored source reaches, where
+            there is no right pose; None where it was not searched.
         overlap_m2: area both clouds cover under the result, square metres.
+        least_overlap_m2: the least overlap worth accepting, from both clouds' areas, square metres.
         overlap_source, overlap_target: shares of each cloud's area that lie in the overlap.
         ground_cells: cells where both see the ground.
         ground_agreeing: of these, cells whose heights agree.
@@ -66,6 +69,8 @@ class Evidence:
     refined_away_m: float
     final_agreeing: int | None = None
     refinement_lost: bool = False
+    null_ratio: float | None = None
+    least_overlap_m2: float = 400.0
 
 
 @dataclass(frozen=True)
@@ -73,13 +78,13 @@ class Limits:
     """Limits between the verdicts.
 
     Attributes:
-        surprise: digits of improbability that the held-out tie points must reach to be believed: -log10 of
-            the
+        neg_log10_p: significance that the held-out tie points must reach to be believed: -log10 of the
             probability that chance makes so many agree.
-        doubtful_surprise: below this the result is refused.
+        doubtful_neg_log10_p: below this the result is refused.
         agreeing: share of the held-out tie points that must agree to accept.
         margin: least strength over the next hypothesis to accept.
-        overlap_m2: least overlap to accept, square metres.
+        null_ratio: least strength over the best of the mirrored source to accept.
+        overlap_m2: least overlap to accept, square metres; that of the evidence if None.
         refined_away: most tolerances by which the refinement may move the overlap away from the tie points.
         ground_agreeing: share of the common ground that must agree in height to accept, where any is seen.
             Of flat ground 60 to 66 % agrees under poses a whole block off, and 74 % and more under true ones.
@@ -90,7 +95,8 @@ class Limits:
     doubtful_neg_log10_p: float = 3.0
     agreeing: float = 0.15
     margin: float = 1.3
-    overlap_m2: float = 400.0
+    null_ratio: float = 1.6
+    overlap_m2: float | None = None
     refined_away: float = 2.0
     ground_agreeing: float = 0.7
 
@@ -143,10 +149,17 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
     ground = evidence.ground_agreeing / max(evidence.ground_cells, 1)
     if evidence.ground_cells >= FEWEST_GROUND_CELLS and ground < limits.ground_agreeing:
         doubts.append(f"only {ground:.0%} of the ground that both clouds see agrees in height")
-    if evidence.overlap_m2 < limits.overlap_m2 / 4:
-        refusals.append(f"the clouds share only {evidence.overlap_m2:.0f} m2 under this result")
-    elif evidence.overlap_m2 < limits.overlap_m2:
-        doubts.append(f"the clouds share only {evidence.overlap_m2:.0f} m2 under this result")
+    if evidence.null_ratio is not None and evidence.null_ratio < limits.null_ratio:
+        doubts.append(
+            "the mirrored source, which has no right pose, fits nearly as well "
+            f"({evidence.null_ratio:.2f} times weaker, wanted {limits.null_ratio:g})"
+        )
+    least = evidence.least_overlap_m2 if limits.overlap_m2 is None else limits.overlap_m2
+    shared = f"the clouds share only {evidence.overlap_m2:.0f} m2 under this result, wanted {least:.0f}"
+    if evidence.overlap_m2 < least / 4:
+        refusals.append(shared)
+    elif evidence.overlap_m2 < least:
+        doubts.append(shared)
     if len(doubts) >= 2 and digits < limits.neg_log10_p:
         refusals.append("several checks fail at once: " + "; ".join(doubts))
         doubts = []
@@ -156,6 +169,10 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
         reasons = [reported]
         if evidence.margin is not None:
             reasons.append(f"the next distinct pose is {evidence.margin:.1f} times weaker")
+        if evidence.null_ratio is not None:
+            reasons.append(
+                f"the mirrored source, which has no right pose, fits {evidence.null_ratio:.1f} times worse"
+            )
         reasons.append(
             f"the clouds share {evidence.overlap_m2:.0f} m2: {evidence.overlap_source:.0%} of the source, "
             f"{evidence.overlap_target:.0%} of the target"
@@ -169,6 +186,7 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
         "neg_log10_p": digits,
         "hypothesis_margin": evidence.margin,
         "patch_support": evidence.support,
+        "null_ratio": evidence.null_ratio,
         "overlap_m2": evidence.overlap_m2,
         "overlap_source": evidence.overlap_source,
         "overlap_target": evidence.overlap_target,

@@ -14,6 +14,7 @@ from mtpcr_geo.core.statistics import chance_within
 from mtpcr_geo.core.types import Pair, SolveSettings, TiePoints
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.method.overlap import overlap_of
+from mtpcr_geo.method.scales import MAX_LEAST_OVERLAP_M2, ground_cell_for, scales_of, tolerance_for
 from mtpcr_geo.method.solve import solve_tie_points
 from mtpcr_geo.verdict.decision import Evidence
 
@@ -60,7 +61,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
     cell = pair.cell
     matches = pair.matches
     radius = matches.search_radius_m if matches is not None else None
-    tolerance = tolerance or max(cell, 1.0) * (1.0 if radius is not None else UNBOUNDED_CELLS)
+    tolerance = tolerance or tolerance_for(cell) * (1.0 if radius is not None else UNBOUNDED_CELLS)
     T = pair.T_target_source
     tie_points = pair.tie_points
     T_level = pair.levelled(T)
@@ -70,7 +71,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
     )
     agreeing = held_out < tolerance
     moved = transforms.apply(T, pair.source.sample)
-    overlap = overlap_of(moved, pair.target.sample)
+    overlap = overlap_of(moved, pair.target.sample, ground_cell_for(cell))
     _, steps = overlap.ground_steps()
     icp = pair.refinement.icp if pair.refinement is not None else None
     evidence = Evidence(
@@ -88,6 +89,8 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         ground_agreeing=int((np.abs(steps) < GROUND_AGREES_M).sum()),
         refined_away_m=_refined_away(pair, T),
         refinement_lost=icp is not None and icp.lost_tie_points,
+        null_ratio=matches.null_ratio if matches is not None else None,
+        least_overlap_m2=_least_overlap_m2(pair),
         final_agreeing=int((residual < tolerance).sum()),
     )
     shift = T[:3, 3]
@@ -109,6 +112,13 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
     return evidence, more
 
 
+def _least_overlap_m2(pair: Pair) -> float:
+    """Return the least overlap worth accepting, square metres, from the areas of both rasters."""
+    if pair.source.bev is None or pair.target.bev is None:
+        return MAX_LEAST_OVERLAP_M2
+    return scales_of(pair.source.bev, pair.target.bev).least_overlap_m2
+
+
 def agreement(pair: Pair, T: Floats, tolerance: float | None = None) -> tuple[int, int]:
     """Count what agrees with a transform: tie points in plan, and cells of common ground in height.
 
@@ -118,7 +128,8 @@ def agreement(pair: Pair, T: Floats, tolerance: float | None = None) -> tuple[in
         tolerance: plan distance within which a tie point agrees, metres; one cell if None.
 
     """
-    _, steps = overlap_of(transforms.apply(T, pair.source.sample), pair.target.sample).ground_steps()
+    moved = transforms.apply(T, pair.source.sample)
+    _, steps = overlap_of(moved, pair.target.sample, ground_cell_for(pair.cell)).ground_steps()
     return tie_points_agreeing(pair, T, tolerance), int((np.abs(steps) < GROUND_AGREES_M).sum())
 
 
@@ -128,7 +139,7 @@ def tie_points_agreeing(pair: Pair, T: Floats, tolerance: float | None = None) -
         return 0
     T_level = pair.levelled(T)
     gap = transforms.apply(T_level, pair.tie_points.source) - pair.tie_points.target
-    return int((np.hypot(gap[:, 0], gap[:, 1]) < (tolerance or max(pair.cell, 1.0))).sum())
+    return int((np.hypot(gap[:, 0], gap[:, 1]) < (tolerance or tolerance_for(pair.cell))).sum())
 
 
 def cross_validated(tie_points: TiePoints, tolerance: float, settings: SolveSettings) -> Floats:

@@ -13,6 +13,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.types import Bev, Pair, SolveSettings
+from mtpcr_geo.method.scales import tolerance_for
 from mtpcr_geo.pipeline.options import Motion, Seed
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 
@@ -141,7 +142,7 @@ class Solve(Stage):
         if pair.tie_points is None:
             raise OptionError(f"{self.label} needs tie points; put mtpcr.inverse_mapping before it")
         tie_points = pair.tie_points
-        tolerance = self.options.tolerance or 1.5 * pair.cell
+        tolerance = self.options.tolerance or 1.5 * tolerance_for(pair.cell)
         options = self.options
         settings = SolveSettings(options.robust_start, options.upright, options.tries, options.seed)
         solution, inlier = solve_tie_points(tie_points, tolerance, settings)
@@ -246,7 +247,8 @@ class AssessOptions(StageOptions):
     neg_log10_p: float = Field(
         6.0,
         ge=0,
-        description="digits of improbability of the held-out tie points' agreement wanted to accept",
+        description="significance of the held-out tie points' agreement wanted to accept: minus log10 of the "
+        "probability that chance makes as many agree",
     )
     margin: float = Field(
         1.3, ge=1, description="strength over the next distinct hypothesis wanted to accept"
@@ -254,7 +256,14 @@ class AssessOptions(StageOptions):
     agreeing: float = Field(
         0.15, ge=0, le=1, description="share of held-out tie points that must agree to accept"
     )
-    min_overlap: float = Field(400.0, ge=0, description="overlap wanted to accept, square metres")
+    null_ratio: float = Field(
+        1.6, ge=0, description="strength over the best of the mirrored source wanted to accept"
+    )
+    min_overlap: float | None = Field(
+        None,
+        ge=0,
+        description="overlap wanted to accept, square metres; from the clouds' areas if not given",
+    )
 
 
 class Assess(Stage):
@@ -279,6 +288,7 @@ class Assess(Stage):
             neg_log10_p=options.neg_log10_p,
             agreeing=options.agreeing,
             margin=options.margin,
+            null_ratio=options.null_ratio,
             overlap_m2=options.min_overlap,
         )
         verdict = assess(evidence, limits, more)
