@@ -25,7 +25,10 @@ def types(pipeline: mg.Pipeline) -> list[str]:
 
 
 def test_a_path_a_text_a_list_and_a_mapping_are_one_pipeline(town_files, tmp_path):
-    stages = [str(town_files[1]), {"type": "filters.crop", "bounds": "([0, 1], [0, 1])"}]
+    stages: list[str | dict[str, str]] = [
+        str(town_files[1]),
+        {"type": "filters.crop", "bounds": "([0, 1], [0, 1])"},
+    ]
     text = json.dumps(stages)
     file = tmp_path / "mine.json"
     file.write_text("// a comment\n" + text, encoding="utf-8")
@@ -84,7 +87,9 @@ def test_the_settings_of_the_first_hold(town_files, tmp_path):
     out.write_text("in the way")
     pipeline = mg.Pipeline([str(town_files[0])], overwrite=True) | {"type": "writers.las", "filename": out}
     pipeline.execute()
-    assert len(laspy.read(out)) == pipeline.stages["readers_las1"].count
+    read = pipeline.stages["readers_las1"]
+    assert isinstance(read, mg.Cloud)
+    assert len(laspy.read(out)) == read.count
 
 
 def test_a_filter_alone_says_that_it_has_nothing_to_take():
@@ -98,10 +103,13 @@ def test_arrays_are_read_first_and_in_their_order(town_files):
     pipeline = mg.Pipeline([steps, {"type": "mtpcr.apply"}], arrays=[target, source])
     pipeline.validate()
     assert pipeline.execute() == len(source)
-    assert TransformChain.of(pipeline.pair).T_file.tobytes() == (
-        mg.register(source, target).T_target_source.tobytes()
-    )
-    assert pipeline.stages["array1"].count == len(target)
+    assert pipeline.pair is not None
+    T = mg.register(source, target).T_target_source
+    assert T is not None
+    assert TransformChain.of(pipeline.pair).T_file.tobytes() == T.tobytes()
+    first = pipeline.stages["array1"]
+    assert isinstance(first, mg.Cloud)
+    assert first.count == len(target)
     assert pipeline.metadata["metadata"]["readers.memory"][1]["count"] == len(source)
 
 
@@ -113,8 +121,10 @@ def test_arrays_of_joined_pipelines_keep_their_names_apart():
         {**one, "inputs": "array1", "tag": "b"}, arrays=[second]
     )
     joined.execute()
-    np.testing.assert_array_equal(joined.stages["a"].to_array(), first)
-    np.testing.assert_array_equal(joined.stages["b"].to_array(), second)
+    for tag, points in (("a", first), ("b", second)):
+        cropped = joined.stages[tag]
+        assert isinstance(cropped, mg.Cloud)
+        np.testing.assert_array_equal(cropped.to_array(), points)
 
 
 def test_structured_arrays_keep_their_dimensions(tmp_path):
