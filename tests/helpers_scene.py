@@ -128,7 +128,7 @@ def make_sides(n: int = 20_000, crs: str | None = "EPSG:25833", tilt: float = 0.
         ("source", source_xyz, np.zeros(3), T_level),
     ):
         side_crs = known if role == "target" else None
-        link = FrameLink(side_crs, origin)
+        link = FrameLink(side_crs, origin, georeferenced=side_crs is not None)
         cloud = ArrayCloud(link.to_file(xyz), side_crs, f"{role}.laz")
         bev = rasterise(transforms.apply(T, xyz), cell)
         sides.append(Side(role, cloud, link, xyz, True, Levelling(T, "plane" if tilt else "none"), bev))

@@ -1,4 +1,4 @@
-"""What a check finds, and how it is put."""
+"""What a check finds, and how it is worded."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ class Finding:
 
 
 def finding_of(error: MtpcrError, code: str, role: Role) -> Finding:
-    """Turn a refusal into a finding: our errors say what is wrong, a semicolon, and what to do."""
+    """Return a refusal as a finding: a message states what is wrong, a semicolon, and what to do."""
     what, _, fix = " ".join(str(error).split()).partition("; ")
     return Finding("error", code, role, what, fix)
 
 
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Put errors first and notes last, the source's before the target's, otherwise in the order found."""
+    """Sort findings: errors before warnings before notes, and of these the source's before the target's."""
     return tuple(sorted(findings, key=lambda found: (_ORDER.index(found.severity), _ORDER.index(found.role))))
 
 
 def rewrite(path: object, **options: float) -> str:
-    """Say how to write a file anew, as LAS 1.4 with its CRS as WKT and a true header.
+    """Return how to write a file anew, as LAS 1.4 with its CRS as WKT and a true header.
 
     Args:
         path: the file.

@@ -1,4 +1,4 @@
-"""What the header and the records of a LAS file say, held against the format's rules."""
+"""The header and the records of a LAS file, compared with the format's rules."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mtpcr_geo.check.findings import Finding, Role, rewrite
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.io.vlr import GEOKEYS, WKT_RECORD, crs_of_records
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from mtpcr_geo.crs import CrsFacts
     from mtpcr_geo.io.las import LasCloud
 
@@ -46,7 +45,7 @@ class RawHeader:
     first_evlr: int
 
     @property
-    def says_wkt(self) -> bool:
+    def states_wkt(self) -> bool:
         """Return whether the WKT bit of the global encoding is set."""
         return bool(self.encoding & _WKT_BIT)
 
@@ -64,7 +63,7 @@ def read_raw(cloud: LasCloud) -> RawHeader:
 
 
 def header_findings(cloud: LasCloud, facts: CrsFacts | None, role: Role) -> Iterator[Finding]:
-    """Hold a file's header against the LAS specification and against what programs bear.
+    """Yield where a file's header departs from the LAS specification, or from what programs can read.
 
     Args:
         cloud: the file, opened.
@@ -97,7 +96,7 @@ def _crs_records(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Findin
                 "warning",
                 "crs-twice",
                 role,
-                f"its WKT says {by_wkt.name}, its GeoTIFF keys say {by_keys.name}; the WKT is taken",
+                f"its WKT states {by_wkt.name}, its GeoTIFF keys {by_keys.name}; the WKT is used",
                 f"find out which is right, then {again}",
             )
     if point_format >= 6 and keys and not wkt:
@@ -109,15 +108,15 @@ def _crs_records(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Findin
             "other programs may see none",
             again,
         )
-    if wkt and not raw.says_wkt:
+    if wkt and not raw.states_wkt:
         yield Finding(
             "warning",
             "wkt-bit-unset",
             role,
-            "it holds WKT but the global encoding's WKT bit is not set: other programs may not look for it",
+            "it has WKT but the global encoding's WKT bit is unset: other programs may not read it",
             again,
         )
-    elif raw.says_wkt and not wkt and point_format < 6:
+    elif raw.states_wkt and not wkt and point_format < 6:
         yield Finding(
             "warning",
             "wkt-bit-wrong",
@@ -125,7 +124,7 @@ def _crs_records(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Findin
             "the global encoding's WKT bit is set but the file holds no WKT",
             again if keys else "",
         )
-    elif point_format >= 6 and not raw.says_wkt:
+    elif point_format >= 6 and not raw.states_wkt:
         yield Finding(
             "note",
             "wkt-bit-unset",
@@ -136,7 +135,7 @@ def _crs_records(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Findin
 
 
 def _agree(one: object, other: object) -> bool:
-    """Compare only what GeoTIFF keys can say: the horizontal part."""
+    """Return whether two CRSs agree in what GeoTIFF keys can state: the horizontal part."""
     from mtpcr_geo.core.errors import CrsError
     from mtpcr_geo.crs import facts_of, same_place
 
@@ -190,8 +189,8 @@ def _counts(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Finding]:
             )
 
 
-def scales_in_metres(scales: NDArray[np.float64], facts: CrsFacts) -> NDArray[np.float64]:
-    """Return the size of a file's last digits in metres, (3,)."""
+def scales_in_metres(scales: Floats, facts: CrsFacts) -> Floats:
+    """Return the storage steps of a file's coordinates in metres, (3,)."""
     plan = facts.unit * (METRES_A_DEGREE if facts.kind == "geographic" else 1.0)
     return np.asarray(scales, np.float64) * [plan, plan, facts.height_unit]
 
@@ -208,7 +207,7 @@ def _scales(cloud: LasCloud, facts: CrsFacts | None, role: Role) -> Iterator[Fin
             "warning",
             "scale-senseless",
             role,
-            f"scales {_triple(scales)} and offsets {_triple(offsets)} make no sense",
+            f"scales {_triple(scales)} and offsets {_triple(offsets)} are not valid",
             "export it again",
         )
         return
@@ -265,27 +264,27 @@ def _rescale(cloud: LasCloud, facts: CrsFacts | None) -> str:
 def _times(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Finding]:
     if "gps_time" not in cloud.header.point_format.dimension_names or not cloud.count:
         return
-    times = _first_times(cloud)
+    times = _some_times(cloud)
     standard = bool(raw.encoding & _STANDARD_TIME_BIT)
     if times is None or not times.any():
         return
-    within = bool(((times >= 0) & (times <= SECONDS_A_WEEK)).all())
+    beyond = times[(times < 0) | (times > SECONDS_A_WEEK)]
     fix = "correct the time type bit of its global encoding; registering does not use times"
-    if standard and within:
+    if standard and not len(beyond):
         yield Finding(
             "note",
             "gps-time",
             role,
-            f"the time type bit says adjusted standard GPS time, but times like {times[0]:.1f} are "
+            f"the time type bit means adjusted standard GPS time, but times like {times[0]:.1f} are "
             "seconds of a week",
             fix,
         )
-    elif not standard and not within:
+    elif not standard and len(beyond):
         yield Finding(
             "note",
             "gps-time",
             role,
-            f"the time type bit says seconds of a GPS week, but times like {times[0]:.1f} are not",
+            f"the time type bit means seconds of a GPS week, but times like {beyond[0]:.1f} are not",
             fix,
         )
     elif not standard and cloud.header.point_format.id >= 6:
@@ -293,25 +292,25 @@ def _times(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Finding]:
             "note",
             "gps-time",
             role,
-            "its times are seconds of a GPS week: they do not say which week",
+            "its times are seconds of a GPS week: the week is not known",
             "",
         )
 
 
-def _first_times(cloud: LasCloud, count: int = 10_000) -> NDArray[np.float64] | None:
+def _some_times(cloud: LasCloud, parts: int = 8, size: int = 2_000) -> Floats | None:
+    """Return times from some places all over the file, (n,) seconds; None where they cannot be read."""
     from laspy import DecompressionSelection as Fields
 
     from mtpcr_geo.core.errors import InputError
 
     try:
-        record = next(iter(cloud.record_chunks(count, Fields.XY_RETURNS_CHANNEL | Fields.GPS_TIME)), None)
+        places = np.unique(np.linspace(0, max(cloud.count - size, 0), parts).astype(int)).tolist()
+        records = cloud.records_at(places, size, Fields.XY_RETURNS_CHANNEL | Fields.GPS_TIME)
+        times = np.concatenate([np.asarray(record["gps_time"], np.float64) for record in records])
     except InputError:
-        return None  # what is broken is found by those who need it
-    if record is None:
-        return None
-    times = np.asarray(record["gps_time"], np.float64)
+        return None  # reported where the points are read
     return times if np.isfinite(times).all() else None
 
 
-def _triple(values: NDArray[np.float64]) -> str:
+def _triple(values: Floats) -> str:
     return f"({', '.join(f'{value + 0.0:g}' for value in values)})"

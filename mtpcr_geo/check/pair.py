@@ -1,4 +1,4 @@
-"""What two clouds are to each other: near or far, alike in height, or one and the same."""
+"""How two clouds lie to each other: their overlap, their heights, and points that both hold."""
 
 from __future__ import annotations
 
@@ -7,18 +7,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.check.findings import Finding
 from mtpcr_geo.check.place import EXCHANGE, area_findings, exchanged, within_area
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.crs.resolve import FARTHEST_APART
 
 if TYPE_CHECKING:
-    from mtpcr_geo.check.preflight import Inspection
+    from mtpcr_geo.check.inspection import Inspection
     from mtpcr_geo.crs import FrameLink
     from mtpcr_geo.method.overlap import Overlap
 
-Floats = NDArray[np.float64]
 
 MOST_CELLS = 4_000_000
 LITTLE_OVERLAP_M2 = 400.0
@@ -93,13 +92,13 @@ def by_area(source: Inspection, target: Inspection) -> Relation:
     from mtpcr_geo.crs.operation import area_of
 
     middles = []
-    for looked in (source, target):
-        facts = looked.claim.facts
+    for cloud in (source, target):
+        facts = cloud.claim.facts
         if facts is None:
-            return Relation("unknown", why=f"the CRS of the {looked.role} is not known")
-        area = area_of(facts, box_points(looked.bounds, 2)) if np.isfinite(looked.bounds).all() else None
+            return Relation("unknown", why=f"the CRS of the {cloud.role} is not known")
+        area = area_of(facts, box_points(cloud.bounds, 2)) if np.isfinite(cloud.bounds).all() else None
         if area is None:
-            return Relation("unknown", why=f"the coordinates of the {looked.role} are no place in its CRS")
+            return Relation("unknown", why=f"the coordinates of the {cloud.role} are no place in its CRS")
         middles += [
             (area.west_lon_degree + area.east_lon_degree) / 2,
             (area.south_lat_degree + area.north_lat_degree) / 2,
@@ -122,7 +121,7 @@ def _area(xyz: Floats, cell: float) -> float:
 
 
 def relation_findings(relation: Relation) -> Iterator[Finding]:
-    """Return whether the clouds lie where they can be registered."""
+    """Yield what keeps clouds from being registered by where they lie: a gap, or little overlap."""
     if relation.name == "apart" and relation.distance_m:
         yield Finding(
             "warning",
@@ -226,21 +225,21 @@ def in_feet(source: Floats, target: Floats) -> tuple[float, Literal["source", "t
 
 
 def link_findings(source: FrameLink, target: FrameLink) -> Iterator[Finding]:
-    """Say by which operation the source comes to the target's frame, if by any."""
-    if source.pipeline is not None and source.file_crs is not None and target.file_crs is not None:
-        accuracy = source.report.get("accuracy_m")
-        grids = ", ".join(source.report.get("grids") or ())
+    """Yield by which operation the source comes to the target's frame, and how its heights are taken."""
+    report = source.report
+    if source.pipeline is not None and source.georeferenced and target.georeferenced:
+        accuracy = report.accuracy_m
+        grids = ", ".join(report.grids)
         yield Finding(
             "note",
             "crs-different",
             "both",
-            f"they are in different CRSs; the source comes to the target's by {source.report['operation']} "
+            f"they are in different CRSs; the source comes to the target's by {report.operation} "
             f"({f'accuracy {accuracy:g} m' if accuracy is not None else 'accuracy not stated'}"
             f"{f', grids {grids}' if grids else ''})",
         )
-    for note in source.report.get("notes", ()):
-        if note.startswith("heights differ"):
-            yield Finding("note", "vertical-taken", "both", note)
+    for note in report.height_notes:
+        yield Finding("note", "vertical-taken", "both", note)
 
 
 def swapped_findings(source: Inspection, target: Inspection) -> Iterator[Finding]:
@@ -251,10 +250,10 @@ def swapped_findings(source: Inspection, target: Inspection) -> Iterator[Finding
         return
     if _meet(source, target, ()):
         return
-    for looked, role in ((source, "source"), (target, "target")):
-        if looked.claim.facts is None or list(area_findings(looked.claim.facts, looked.bounds, "both")):
-            continue  # said already
-        other_way = within_area(looked.claim.facts, exchanged(looked.bounds))
+    for cloud, role in ((source, "source"), (target, "target")):
+        if cloud.claim.facts is None or list(area_findings(cloud.claim.facts, cloud.bounds, "both")):
+            continue  # reported already
+        other_way = within_area(cloud.claim.facts, exchanged(cloud.bounds))
         if other_way is not False and _meet(source, target, (role,)):
             yield Finding(
                 "warning",
@@ -274,10 +273,10 @@ def _meet(source: Inspection, target: Inspection, turned: tuple[str, ...]) -> bo
     from mtpcr_geo.crs import resolve_frames
 
     boxes = [
-        ArrayCloud(exchanged(looked.bounds) if looked.role in turned else looked.bounds)
-        for looked in (source, target)
+        ArrayCloud(exchanged(cloud.bounds) if cloud.role in turned else cloud.bounds)
+        for cloud in (source, target)
     ]
-    crs = [looked.claim.facts.crs if looked.claim.facts is not None else None for looked in (source, target)]
+    crs = [cloud.claim.facts.crs if cloud.claim.facts is not None else None for cloud in (source, target)]
     try:
         frame, to_target, to_source = resolve_frames(
             boxes[1], boxes[0], target_crs=crs[1], source_crs=crs[0], vertical="assume-same"
@@ -300,7 +299,7 @@ def same_points_findings(source: Inspection, target: Inspection) -> Iterator[Fin
     """Find points that stand in both clouds, coordinate by coordinate: a cloud fits itself perfectly."""
     if source.scan is None or target.scan is None:
         return
-    step = float(max(np.max(looked.cloud.header.scales) for looked in (source, target)))
+    step = float(max(np.max(one.cloud.header.scales) for one in (source, target)))
     if not step > 0:
         return
     few = source.scan.sample[:: max(1, len(source.scan.sample) // _COMPARED)]
@@ -322,11 +321,3 @@ def same_points_findings(source: Inspection, target: Inspection) -> Iterator[Fin
         "they fit by themselves, which proves nothing",
         "give two clouds that were measured independently",
     )
-
-
-def _keys(xyz: Floats, step: float) -> NDArray[np.uint64]:
-    """Return one number a place, the same for the same place, (n,)."""
-    steps = np.rint(xyz / step).astype(np.int64).view(np.uint64)
-    # odd numbers without pattern: products wrap around, and places do not fall together
-    odd = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-    return np.asarray((steps * odd).sum(axis=1, dtype=np.uint64))

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.check.findings import Finding, Role
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError
 from mtpcr_geo.core.frames import box_points
 from mtpcr_geo.crs import CrsFacts, facts_of, parse_crs, same_place
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from mtpcr_geo.io.las import LasCloud
 
-Floats = NDArray[np.float64]
 # grids are used a little beyond their area, and neighbouring zones for one another; they do not break there
 BEYOND_AREA_DEG, NEIGHBOUR_DEG = 0.5, 6.0
 EXCHANGE = "exchange them, for example with PDAL's filters.ferry, or name the CRS that has them so"
@@ -35,8 +34,8 @@ class Claim:
     """The CRS in which a cloud's coordinates are taken to be.
 
     Attributes:
-        facts: it, taken apart; None where nobody says one, or it cannot be handled.
-        by: who says so: "WKT", "GeoTIFF keys", "option" or "".
+        facts: it, taken apart; None where neither file nor user states one, or it cannot be handled.
+        by: what states it: "WKT", "GeoTIFF keys", "option" or "".
 
     """
 
@@ -44,13 +43,20 @@ class Claim:
     by: str
 
 
-def claim_of(cloud: LasCloud, said: str | None, local: bool) -> Claim:
-    """Find out what CRS a cloud is taken to be in, by its file or by what the user says."""
+def claim_of(cloud: LasCloud, declared: str | None, local: bool) -> Claim:
+    """Return the CRS that a cloud is taken to be in: the declared one, else that of its file.
+
+    Args:
+        cloud: the file.
+        declared: the CRS that the user gives for it, or None.
+        local: whether the user declares the cloud to be local.
+
+    """
     try:
         if local:
             return Claim(facts_of(None), "option")
-        if said is not None:
-            return Claim(facts_of(parse_crs(said)), "option")
+        if declared is not None:
+            return Claim(facts_of(parse_crs(declared)), "option")
         if cloud.crs is None:
             return Claim(None, "")
         return Claim(facts_of(cloud.crs), _stated_by(cloud))
@@ -64,7 +70,7 @@ def _stated_by(cloud: LasCloud) -> str:
 
 
 def code_of(crs: CRS | None) -> str:
-    """Name a CRS by codes, such as "EPSG:25832+7837"; "" where it has none."""
+    """Return a CRS as codes, such as "EPSG:25832+7837"; "" where it has none."""
     if crs is None:
         return ""
     code = crs.to_authority()
@@ -78,7 +84,7 @@ def code_of(crs: CRS | None) -> str:
 
 
 def epochs_of(cloud: LasCloud, facts: CrsFacts | None) -> tuple[float | None, float | None]:
-    """Find the epoch of the coordinates, and that at which a dynamic datum is defined, in years."""
+    """Return the epoch of the coordinates, and that at which a dynamic datum is defined, in years."""
     epoch: float | None = None
     for record in cloud.records:
         if record.record_id == WKT_RECORD and record.states_crs:
@@ -96,20 +102,20 @@ def epochs_of(cloud: LasCloud, facts: CrsFacts | None) -> tuple[float | None, fl
 
 
 def claim_findings(
-    cloud: LasCloud, claim: Claim, said: str | None, local: bool, role: Role, one: bool
+    cloud: LasCloud, claim: Claim, declared: str | None, local: bool, role: Role, one: bool
 ) -> Iterator[Finding]:
-    """Return whether the CRS is known, by whom, and what it leaves open.
+    """Yield what is missing or unclear in a cloud's CRS.
 
     Args:
         cloud: the file.
         claim: the CRS it is taken to be in.
-        said: what the user says of it.
-        local: whether the user says that it is local.
+        declared: the CRS that the user gives for it, or None.
+        local: whether the user declares it to be local.
         role: which cloud it is.
         one: whether it is the only one.
 
     """
-    if said is None and not local and cloud.crs is None:
+    if declared is None and not local and cloud.crs is None:
         option = "--source-crs" if one else f"--{role}-crs"
         yield Finding(
             "error",
@@ -120,7 +126,7 @@ def claim_findings(
             f"give {option} EPSG:..., or {option} local if its coordinates are local metres",
         )
     elif cloud.crs_problem:
-        yield Finding("note", "crs-unreadable", role, f"{cloud.crs_problem}; what you say is taken instead")
+        yield Finding("note", "crs-unreadable", role, f"{cloud.crs_problem}; the one given by option is used")
     elif cloud.crs is not None and claim.facts is not None and claim.by == "option":
         named = claim.facts.crs
         if named is None or not same_place(named, cloud.crs):
@@ -128,7 +134,7 @@ def claim_findings(
                 "note",
                 "crs-overridden",
                 role,
-                f"the file states {cloud.crs.name}; {claim.facts.name} is taken instead, as you say",
+                f"the file states {cloud.crs.name}; {claim.facts.name} is used instead, as given by option",
             )
     epoch, frame = epochs_of(cloud, claim.facts)
     if frame is not None and epoch is None:
@@ -166,7 +172,7 @@ def _guess(cloud: LasCloud) -> str:
 
 
 def area_findings(facts: CrsFacts, bounds: Floats, role: Role) -> Iterator[Finding]:
-    """Find coordinates beyond the area for which a CRS is made, among them exchanged axes.
+    """Yield coordinates beyond the area for which a CRS is made, among them exchanged axes.
 
     Args:
         facts: the CRS.
@@ -237,7 +243,7 @@ def within_area(facts: CrsFacts, bounds: Floats, beyond: float = BEYOND_AREA_DEG
 
 
 def _area_of_use(facts: CrsFacts) -> tuple[float, float, float, float] | None:
-    """Find the area of a CRS; WKT1 states none, but mostly a code by which it can be looked up."""
+    """Return the area of a CRS; WKT1 states none, but mostly a code by which it can be looked up."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 

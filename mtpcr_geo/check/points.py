@@ -1,4 +1,4 @@
-"""What the points of one cloud say: where they truly lie, how densely, and what stands out."""
+"""What the points of one cloud show: their true bounds, their density, and outliers."""
 
 from __future__ import annotations
 
@@ -7,16 +7,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.check.findings import Finding, Role, rewrite
+from mtpcr_geo.core.arrays import ComparesArrays, Floats, Mask
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 
 if TYPE_CHECKING:
     from mtpcr_geo.io.las import LasCloud
     from mtpcr_geo.io.sample import Scan
 
-Floats = NDArray[np.float64]
 
 SPARSE_PER_M2, VERY_SPARSE_PER_M2 = 0.5, 0.1
 FEW_POINTS = 10_000
@@ -26,7 +25,7 @@ LOWEST_LAND_M, HIGHEST_LAND_M = -500.0, 9000.0
 
 
 class Watched(Cloud):
-    """A cloud that notes the bounds of all its points, noise too, while someone streams it."""
+    """A cloud that notes the bounds of all its points, noise included, while it is streamed."""
 
     def __init__(self, cloud: Cloud) -> None:
         self.cloud = cloud
@@ -35,23 +34,23 @@ class Watched(Cloud):
         self.seen_minimum, self.seen_maximum = np.full(3, np.inf), np.full(3, -np.inf)
 
     def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
-        """Stream the coordinates."""
+        """Yield (n, 3) coordinates of the cloud watched."""
         yield from self.cloud.xyz_chunks(size)
 
     def table_chunks(self, size: int = CHUNK_POINTS) -> Iterator[PointTable]:
-        """Stream all dimensions."""
+        """Yield tables of the cloud watched."""
         yield from self.cloud.table_chunks(size)
 
-    def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, NDArray[np.bool_]]]:
-        """Stream coordinates and what is noise, and note the bounds."""
+    def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, Mask]]:
+        """Yield coordinates and which points are noise, and note the bounds."""
         for xyz, noise in self.cloud.noise_chunks(size):
             np.fmin(self.seen_minimum, np.fmin.reduce(xyz, axis=0), out=self.seen_minimum)
             np.fmax(self.seen_maximum, np.fmax.reduce(xyz, axis=0), out=self.seen_maximum)
             yield xyz, noise
 
 
-@dataclass(frozen=True)
-class Measured:
+@dataclass(frozen=True, eq=False)
+class Measured(ComparesArrays):
     """A cloud in metres of its own frame.
 
     Attributes:
@@ -77,7 +76,7 @@ class Measured:
 
 
 def bounds_findings(cloud: LasCloud, watched: Watched, role: Role) -> Iterator[Finding]:
-    """Hold the header's bounds against those of the points read."""
+    """Yield where the header's bounds differ from those of the points read."""
     if not (np.isfinite(watched.seen_minimum).all() and np.isfinite(cloud.minimum + cloud.maximum).all()):
         return
     tolerance = np.maximum(2.0 * np.asarray(cloud.header.scales), 1e-9 * np.abs(watched.seen_maximum))
@@ -100,13 +99,13 @@ def bounds_findings(cloud: LasCloud, watched: Watched, role: Role) -> Iterator[F
             "warning" if spare[axis] > max(extent, 1.0) else "note",
             "bounds-wide",
             role,
-            f"the header's bounds reach up to {spare[axis]:.6g} units beyond the points in {'xyz'[axis]}",
+            f"the header's bounds extend up to {spare[axis]:.6g} units beyond the points in {'xyz'[axis]}",
             rewrite(cloud.path),
         )
 
 
 def noise_findings(scan: Scan, role: Role) -> Iterator[Finding]:
-    """Say how much of the cloud is noise, where that is much."""
+    """Yield the share of noise, where it is large."""
     share = scan.dropped / max(scan.count, 1)
     if share > MUCH_NOISE:
         yield Finding(
@@ -114,12 +113,12 @@ def noise_findings(scan: Scan, role: Role) -> Iterator[Finding]:
             "noise",
             role,
             f"{share:.0%} of its points are classified as noise (7, 18) or withheld, and are left out",
-            "look at its classification, if they are not noise",
+            "check its classification, if they are not noise",
         )
 
 
 def density_findings(measured: Measured, count: int, role: Role) -> Iterator[Finding]:
-    """Return whether there are enough points to see shapes by."""
+    """Yield whether points are too few or too sparse to show shapes."""
     if measured.per_m2 < SPARSE_PER_M2:
         very = measured.per_m2 < VERY_SPARSE_PER_M2
         yield Finding(
@@ -141,12 +140,12 @@ def density_findings(measured: Measured, count: int, role: Role) -> Iterator[Fin
 
 
 def height_findings(measured: Measured, unit_name: str, stated: bool, role: Role) -> Iterator[Finding]:
-    """Find heights that are no heights of a place: constant, stray, in other units, or off the earth.
+    """Yield heights that are no heights of a place: constant, stray, in other units, or off the earth.
 
     Args:
         measured: the cloud in metres.
         unit_name: unit in which its heights are taken to be.
-        stated: whether a CRS says so, so that absolute heights mean something.
+        stated: whether a CRS states that, so that absolute heights have a meaning.
         role: which cloud it is.
 
     """
@@ -193,7 +192,7 @@ def height_findings(measured: Measured, unit_name: str, stated: bool, role: Role
 
 
 def plan_findings(measured: Measured, role: Role) -> Iterator[Finding]:
-    """Find the few points far away that make a raster huge."""
+    """Yield the few points far away that make a raster huge."""
     low, high = np.percentile(measured.sample[:, :2], [0.1, 99.9], axis=0)
     stray = np.maximum(measured.high[:2] - high, low - measured.low[:2])
     if (stray > 5.0 * (high - low) + 20.0).any():

@@ -1,4 +1,4 @@
-"""The check itself: every file looked at once, in the order in which `register` would refuse it."""
+"""The check itself: every file is read once, in the order in which `register` would refuse it."""
 
 from __future__ import annotations
 
@@ -6,62 +6,30 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from mtpcr_geo.check import header, pair, place, points
-from mtpcr_geo.check.describe import describe
+from mtpcr_geo.check.describe import CloudFacts, describe
 from mtpcr_geo.check.findings import CloudRole, Finding, Role, by_severity, finding_of
+from mtpcr_geo.check.inspection import Inspection
 from mtpcr_geo.core.errors import CrsError, InputError, MtpcrError, OptionError, RegistrationError
 from mtpcr_geo.core.frames import box_points
 from mtpcr_geo.crs import FrameLink, WorkFrame, resolve_frames
-from mtpcr_geo.io.las import LasCloud, check_distinct, open_cloud
+from mtpcr_geo.io.las import check_distinct, open_cloud
 from mtpcr_geo.io.sample import Scan, scan
 from mtpcr_geo.method.bev import choose_cell, coverage_of, grid_around
 
 if TYPE_CHECKING:
+    from mtpcr_geo.core.progress import Progress
     from mtpcr_geo.crs import Vertical
     from mtpcr_geo.method.overlap import Overlap
-    from mtpcr_geo.pipeline.stage import Progress
 
-Floats = NDArray[np.float64]
 Frames = tuple[WorkFrame, FrameLink, FrameLink]
 
 
 @dataclass
-class Inspection:
-    """One cloud, as far as it could be looked at.
-
-    Attributes:
-        role: "source" or "target".
-        cloud: the opened file.
-        claim: the CRS it is taken to be in.
-        scan: its sample and true bounds, or None where it is unsound.
-        measured: it in metres of a frame of its own, or None.
-        too_large: why no raster of it can be made, or None.
-
-    """
-
-    role: CloudRole
-    cloud: LasCloud
-    claim: place.Claim
-    scan: Scan | None = None
-    measured: points.Measured | None = None
-    too_large: RegistrationError | None = None
-
-    @property
-    def bounds(self) -> Floats:
-        """(2, 3) lowest and highest coordinates: those of the points if known, else of the header."""
-        if self.scan is not None:
-            return np.stack([self.scan.minimum, self.scan.maximum])
-        return np.stack([self.cloud.minimum, self.cloud.maximum])
-
-
-@dataclass
 class CheckReport:
-    """What a check came to.
+    """The result of a check.
 
     Attributes:
         clouds: facts of each cloud, by role; a file that cannot be opened is not in it.
@@ -71,7 +39,7 @@ class CheckReport:
 
     """
 
-    clouds: dict[str, dict[str, Any]] = field(default_factory=dict)
+    clouds: dict[CloudRole, CloudFacts] = field(default_factory=dict)
     relation: pair.Relation | None = None
     findings: tuple[Finding, ...] = ()
     exit_code: int = 0
@@ -83,20 +51,20 @@ class CheckReport:
 
 
 def _frames(
-    source: Inspection, target: Inspection, said: dict[CloudRole, str | None], local: bool, vertical: Vertical
+    source: Inspection,
+    target: Inspection,
+    declared: dict[CloudRole, str | None],
+    local: bool,
+    vertical: Vertical,
 ) -> Frames:
     return resolve_frames(
         target.cloud,
         source.cloud,
-        target_crs=said["target"],
-        source_crs=said["source"],
+        target_crs=declared["target"],
+        source_crs=declared["source"],
         local=local,
         vertical=vertical,
     )
-
-
-def _is_local(looked: Inspection) -> bool:
-    return looked.claim.facts is not None and looked.claim.facts.kind == "local"
 
 
 def check_clouds(
@@ -109,14 +77,14 @@ def check_clouds(
     vertical: Vertical = "refuse",
     progress: Progress | None = None,
 ) -> CheckReport:
-    """Look at one or two clouds as `register` would, and say what is wrong with them and how to mend it.
+    """Read one or two clouds as `register` would; report what is wrong with them, and how to mend it.
 
     Headers are read, and the points streamed once; of large clouds a sample is kept. Whether `register`
     would go on is found by the very functions that it calls, in its order.
 
     Args:
         source: LAS, LAZ or COPC file that would move.
-        target: the one that would stay, or None to look at one file alone.
+        target: the one that would stay, or None to check one file alone.
         source_crs: CRS of the source, instead of what its file states.
         target_crs: CRS of the target, likewise.
         local: both clouds are local, in metres.
@@ -134,116 +102,120 @@ def check_clouds(
     files = [("source", source, source_crs if target is not None else source_crs or target_crs)]
     if target is not None:
         files.insert(0, ("target", target, target_crs))
-    said = {role: text for role, _, text in files}
+    declared = {role: text for role, _, text in files}
     for role, path, text in files:
         with check.stopping("input", role):
             cloud = open_cloud(path)
-            check.looked[role] = Inspection(role, cloud, place.claim_of(cloud, text, local))
-    if target is not None and len(check.looked) == 2:
+            check.inspections[role] = Inspection(role, cloud, place.claim_of(cloud, text, local))
+    if target is not None and len(check.inspections) == 2:
         with check.stopping("same-cloud", "both"):
-            check_distinct(check.looked["target"].cloud, check.looked["source"].cloud)
-    for looked in check.looked.values():
-        check.look(looked, said[looked.role], local, one=target is None, progress=progress)
-    if target is not None and len(check.looked) == 2:
-        check.compare(said, local, vertical)
+            check_distinct(check.inspections["target"].cloud, check.inspections["source"].cloud)
+    for inspection in check.inspections.values():
+        check.inspect(inspection, declared[inspection.role], local, one=target is None, progress=progress)
+    if target is not None and len(check.inspections) == 2:
+        check.compare(declared, local, vertical)
     else:
-        check.alone(said, local)
+        check.alone(declared, local)
     check.rasters()
     return check.report()
 
 
 class _Check:
-    """A check on its way: what was looked at, found and refused so far."""
+    """A check in progress: what was inspected, found and refused so far."""
 
     def __init__(self) -> None:
-        self.looked: dict[CloudRole, Inspection] = {}
+        self.inspections: dict[CloudRole, Inspection] = {}
         self.findings: list[Finding] = []
         self.refusals: list[MtpcrError] = []
         self.relation: pair.Relation | None = None
 
     @contextmanager
     def stopping(self, code: str, role: Role) -> Iterator[None]:
-        """Note an error with which `register` would end, and go on with the rest."""
+        """Return a context that notes the error with which `register` would end, and goes on."""
         try:
             yield
         except MtpcrError as error:
             self.refuse(error, code, role)
 
     def refuse(self, error: MtpcrError, code: str, role: Role) -> None:
-        """Note that `register` would end here, and why, if that is not said already."""
+        """Note that `register` would end here, and why, unless that is reported already."""
         self.refusals.append(error)
-        said = isinstance(error, CrsError) and any(found.code == "crs-missing" for found in self.findings)
+        known = isinstance(error, CrsError) and any(found.code == "crs-missing" for found in self.findings)
         finding = finding_of(error, code, role)
-        if not said and finding.what not in (found.what for found in self.findings):
+        if not known and finding.what not in (found.what for found in self.findings):
             self.findings.append(finding)
 
-    def look(
-        self, looked: Inspection, said: str | None, local: bool, one: bool, progress: Progress | None
+    def inspect(
+        self, inspection: Inspection, declared: str | None, local: bool, one: bool, progress: Progress | None
     ) -> None:
-        """Look at one cloud by itself."""
-        cloud, claim, role = looked.cloud, looked.claim, looked.role
+        """Inspect one cloud by itself."""
+        cloud, claim, role = inspection.cloud, inspection.claim, inspection.role
         found = self.findings
-        found += place.claim_findings(cloud, claim, said, local, role, one)
+        found += place.claim_findings(cloud, claim, declared, local, role, one)
         found += header.header_findings(cloud, claim.facts, role)
-        looked.scan = self._scan(looked, progress)
+        inspection.scan = self._scan(inspection, progress)
         if claim.facts is not None:
-            found += place.area_findings(claim.facts, looked.bounds, role)
-        if looked.scan is None:
+            found += place.area_findings(claim.facts, inspection.bounds, role)
+        if inspection.scan is None:
             return
-        found += points.noise_findings(looked.scan, role)
+        found += points.noise_findings(inspection.scan, role)
         try:
-            _, link, _ = resolve_frames(cloud, cloud, target_crs=said, source_crs=said, local=local)
-            sample = link.to_work(looked.scan.sample)
+            _, link, _ = resolve_frames(cloud, cloud, target_crs=declared, source_crs=declared, local=local)
+            sample = link.to_work(inspection.scan.sample)
         except (CrsError, InputError):
-            return  # said where the common frame is settled
+            return  # reported where the common frame is settled
         try:
             dense = coverage_of(sample, points=cloud.count)
         except RegistrationError as error:
-            looked.too_large = error
+            inspection.too_large = error
             return
         # a sample may miss the outermost points
-        outline = sample if looked.scan.complete else link.to_work(box_points(looked.bounds))
+        outline = sample if inspection.scan.complete else link.to_work(box_points(inspection.bounds))
         low, high = outline.min(axis=0), outline.max(axis=0)
-        looked.measured = points.Measured(
+        inspection.measured = points.Measured(
             sample, low, high, float(link.origin[2]), dense.per_m2, dense.occupied_m2
         )
-        found += points.density_findings(looked.measured, cloud.count, role)
-        found += points.plan_findings(looked.measured, role)
+        found += points.density_findings(inspection.measured, cloud.count, role)
+        found += points.plan_findings(inspection.measured, role)
         if claim.facts is not None and claim.facts.kind != "geocentric":
-            stated = claim.facts.kind != "local"
-            found += points.height_findings(looked.measured, claim.facts.height_unit_name, stated, role)
+            stated = claim.facts.georeferenced
+            found += points.height_findings(inspection.measured, claim.facts.height_unit_name, stated, role)
 
-    def _scan(self, looked: Inspection, progress: Progress | None) -> Scan | None:
-        watched = points.Watched(looked.cloud)
+    def _scan(self, inspection: Inspection, progress: Progress | None) -> Scan | None:
+        watched = points.Watched(inspection.cloud)
         try:
             found = scan(watched, progress=progress)
         except InputError as error:
-            self.refuse(error, "input", looked.role)
+            self.refuse(error, "input", inspection.role)
             return None
-        self.findings += points.bounds_findings(looked.cloud, watched, looked.role)
+        self.findings += points.bounds_findings(inspection.cloud, watched, inspection.role)
         return found
 
-    def alone(self, said: dict[CloudRole, str | None], local: bool) -> None:
+    def alone(self, declared: dict[CloudRole, str | None], local: bool) -> None:
         """Settle the frame of the only cloud that could be opened."""
-        for role, looked in self.looked.items():
-            with self.stopping("crs", looked.role):
+        for role, inspection in self.inspections.items():
+            with self.stopping("crs", inspection.role):
                 resolve_frames(
-                    looked.cloud, looked.cloud, target_crs=said[role], source_crs=said[role], local=local
+                    inspection.cloud,
+                    inspection.cloud,
+                    target_crs=declared[role],
+                    source_crs=declared[role],
+                    local=local,
                 )
 
-    def compare(self, said: dict[CloudRole, str | None], local: bool, vertical: Vertical) -> None:
-        """Settle the common frame of both clouds, and look at them in it."""
-        source, target = self.looked["source"], self.looked["target"]
+    def compare(self, declared: dict[CloudRole, str | None], local: bool, vertical: Vertical) -> None:
+        """Settle the common frame of both clouds, and compare them in it."""
+        source, target = self.inspections["source"], self.inspections["target"]
         self.relation = pair.Relation("unknown")
         try:
-            frames = _frames(source, target, said, local, vertical)
+            frames = _frames(source, target, declared, local, vertical)
             self.findings += pair.link_findings(frames[2], frames[1])
         except MtpcrError as error:
             self.refuse(error, "crs", "both")
             frames = None
         with self.stopping("crs", "both") if frames is not None else suppress(MtpcrError):
             # where only their heights do not go together, their plan still can be compared
-            self._relate(frames or _frames(source, target, said, local, "assume-same"), source, target)
+            self._relate(frames or _frames(source, target, declared, local, "assume-same"), source, target)
         if self.relation.name == "unknown" and not self.relation.why:
             self.relation = pair.by_area(source, target)
         if self.relation.name != "overlapping":
@@ -259,8 +231,10 @@ class _Check:
         samples = [
             link.to_work(scan.sample) for link, scan in ((to_source, source.scan), (to_target, target.scan))
         ]
-        if frame.crs is None or _is_local(source) or _is_local(target):
-            local = " and the ".join(looked.role for looked in (source, target) if _is_local(looked))
+        if frame.crs is None or source.is_local or target.is_local:
+            local = " and the ".join(
+                inspection.role for inspection in (source, target) if inspection.is_local
+            )
             self.relation = pair.Relation(
                 "unknown", why=f"the {local} has local coordinates; registering finds its place"
             )
@@ -272,23 +246,27 @@ class _Check:
             self.findings += pair.height_pair_findings(overlap, float(to_target.origin[2]))
 
     def rasters(self) -> None:
-        """See whether the rasters of the registration would fit into memory."""
-        for looked in self.looked.values():
-            if looked.too_large is not None:
-                self.refuse(looked.too_large, "raster-size", looked.role)
-        sides = [(looked, looked.measured) for looked in self.looked.values() if looked.measured is not None]
+        """Note a refusal where the rasters of the registration would not fit into memory."""
+        for inspection in self.inspections.values():
+            if inspection.too_large is not None:
+                self.refuse(inspection.too_large, "raster-size", inspection.role)
+        sides = [
+            (inspection, inspection.measured)
+            for inspection in self.inspections.values()
+            if inspection.measured is not None
+        ]
         if self.refusals or not sides:
             return
         cell = choose_cell(*(measured.per_m2 for _, measured in sides))
-        for looked, measured in sides:
-            with self.stopping("raster-size", looked.role):
+        for inspection, measured in sides:
+            with self.stopping("raster-size", inspection.role):
                 grid_around(measured.low, measured.high, cell)
 
     def report(self) -> CheckReport:
         """Put together what was found."""
-        in_order = sorted(self.looked.items())
+        in_order = sorted(self.inspections.items())
         return CheckReport(
-            {role: describe(looked) for role, looked in in_order},
+            {role: describe(inspection) for role, inspection in in_order},
             self.relation,
             by_severity(self.findings),
             self.refusals[0].exit_code if self.refusals else 0,

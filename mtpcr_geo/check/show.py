@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mtpcr_geo.check.pair import Relation, distance_text
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from mtpcr_geo.check.describe import CloudFacts
     from mtpcr_geo.check.preflight import CheckReport
 
 _COLOUR = {"error": "bold red", "warning": "bold yellow", "note": "cyan"}
@@ -29,13 +30,13 @@ def show(report: CheckReport, *, as_json: bool, quiet: bool) -> None:
 
 
 def json_of(report: CheckReport) -> str:
-    """Put a check as JSON."""
+    """Return a check as JSON."""
     from mtpcr_geo.export.run_json import plain
 
     whole = {
         "goes_on": report.goes_on,
         "exit_code": report.exit_code,
-        "clouds": report.clouds,
+        "clouds": {role: asdict(facts) for role, facts in report.clouds.items()},
         "relation": None if report.relation is None else asdict(report.relation),
         "findings": [asdict(finding) for finding in report.findings],
     }
@@ -71,9 +72,9 @@ def print_report(console: Console, report: CheckReport) -> None:
 
 
 def relation_text(relation: Relation) -> str:
-    """Say in words how two clouds lie to each other."""
+    """Return how two clouds lie to each other, as one line."""
     if relation.name == "unknown":
-        return f"whether they overlap cannot be told: {relation.why}"
+        return f"whether they overlap is not known: {relation.why}"
     if relation.name == "apart":
         return f"by their CRSs they are {distance_text(relation.distance_m or 0.0)} apart"
     return (
@@ -82,43 +83,43 @@ def relation_text(relation: Relation) -> str:
     )
 
 
-def _cells(facts: dict[str, Any]) -> dict[str, str]:
-    crs = facts["crs"]
-    code = f" ({facts['crs_code']})" if facts["crs_code"] else ""
-    noise = f", {facts['noise_points']:,} of them noise" if facts["noise_points"] else ""
-    density, area = facts["density_per_m2"], facts["area_m2"]
-    epoch = f"{facts['epoch']:g}" if facts["epoch"] is not None else None
-    if epoch is None and facts["datum_epoch"] is not None:
-        epoch = f"not stated (datum of {facts['datum_epoch']:g})"
+def _cells(facts: CloudFacts) -> dict[str, str]:
+    crs = facts.crs
+    code = f" ({facts.crs_code})" if facts.crs_code else ""
+    noise = f", {facts.noise_points:,} of them noise" if facts.noise_points else ""
+    density, area = facts.density_per_m2, facts.area_m2
+    epoch = f"{facts.epoch:g}" if facts.epoch is not None else None
+    if epoch is None and facts.datum_epoch is not None:
+        epoch = f"not stated (datum of {facts.datum_epoch:g})"
     return {
-        "file": facts["file"],
-        "format": facts["format"],
-        "points": f"{facts['points']:,}{noise}",
+        "file": facts.file,
+        "format": facts.format,
+        "points": f"{facts.points:,}{noise}",
         "CRS": _UNKNOWN if crs is None else f"{crs}{code}",
-        "said by": facts["crs_by"] or _UNKNOWN,
-        "units": " / ".join(_both(facts["horizontal_unit"], facts["vertical_unit"])),
-        "heights": facts["heights"] or _UNKNOWN,
+        "CRS stated by": facts.crs_by or _UNKNOWN,
+        "units": " / ".join(_both(facts.horizontal_unit, facts.vertical_unit)),
+        "heights": facts.heights or _UNKNOWN,
         "epoch": epoch or _UNKNOWN,
         "density": _UNKNOWN if density is None else f"{density:.3g} per m2 on {area:,.0f} m2",
-        "extent": _UNKNOWN if facts["extent_m"] is None else f"{_numbers(facts['extent_m'], 1, ' x ')} m",
-        "lowest": _numbers(facts["minimum"], _digits(facts), "  "),
-        "highest": _numbers(facts["maximum"], _digits(facts), "  "),
-        "scale": _triple(facts["scale"]),
-        "offset": _triple(facts["offset"]),
+        "extent": _UNKNOWN if facts.extent_m is None else f"{_numbers(facts.extent_m, 1, ' x ')} m",
+        "lowest": _numbers(facts.minimum, _decimals(facts), "  "),
+        "highest": _numbers(facts.maximum, _decimals(facts), "  "),
+        "scale": _triple(facts.scale),
+        "offset": _triple(facts.offset),
     }
 
 
 def _both(horizontal: str | None, vertical: str | None) -> list[str]:
-    words = [word for word in (horizontal, vertical) if word is not None]
-    return words if len(set(words)) > 1 else words[:1] or [_UNKNOWN]
+    units = [unit for unit in (horizontal, vertical) if unit is not None]
+    return units if len(set(units)) > 1 else units[:1] or [_UNKNOWN]
 
 
-def _digits(facts: dict[str, Any]) -> int:
-    return 7 if facts["horizontal_unit"] and facts["horizontal_unit"].startswith("degree") else 2
+def _decimals(facts: CloudFacts) -> int:
+    return 7 if facts.horizontal_unit and facts.horizontal_unit.startswith("degree") else 2
 
 
-def _numbers(values: Sequence[float], digits: int, between: str) -> str:
-    return between.join(f"{value:.{digits}f}" for value in values)
+def _numbers(values: Sequence[float], decimals: int, between: str) -> str:
+    return between.join(f"{value:.{decimals}f}" for value in values)
 
 
 def _triple(values: Sequence[float]) -> str:

@@ -1,31 +1,33 @@
-"""The metric work frame, and the exact way between it and the coordinates of a file."""
+"""The metric work frame, and the exact conversion between it and the coordinates of a file."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import ComparesArrays, Floats
 from mtpcr_geo.core.errors import CrsError
 
 if TYPE_CHECKING:
     from pyproj import CRS, Transformer
 
-Floats = NDArray[np.float64]
+
+Vertical = Literal["refuse", "assume-same", "estimate"]
+"""What to do where two clouds' heights have different or unknown vertical datums."""
 
 
-@dataclass(frozen=True)
-class WorkFrame:
+@dataclass(frozen=True, eq=False)
+class WorkFrame(ComparesArrays):
     """The frame of all computation: a projected metric CRS, shifted to an integer origin.
 
     Attributes:
         crs: the projected metric CRS, or None for a local frame in metres.
         origin: (3,) whole metres, subtracted from CRS coordinates.
-        output: the way from the target's work coordinates to a CRS asked for, where that is not the target's.
+        output: the link from the target's work coordinates to another CRS, where one was asked for.
 
     """
 
@@ -35,8 +37,51 @@ class WorkFrame:
 
 
 @dataclass(frozen=True)
-class FrameLink:
-    """The way between a file's coordinates and work coordinates of its side.
+class OperationReport:
+    """How a file's coordinates come to the work frame, and what had to be assumed for it.
+
+    Attributes:
+        operation: name of the coordinate operation, as in the EPSG registry.
+        accuracy_m: its accuracy in metres, or None where nobody stated one.
+        grids: names of the grid files that it uses.
+        heights: what the file's heights refer to.
+        vertical: what was to be done with different or unknown vertical datums.
+        height_notes: how heights of different or unknown datums were taken, a sentence each.
+        unit_notes: what had to be assumed of units and scale, a sentence each.
+        grid_scale: least and greatest length, on the map, of a metre on the ground; None where not known.
+
+    """
+
+    operation: str = "units only"
+    accuracy_m: float | None = 0.0
+    grids: tuple[str, ...] = ()
+    heights: str = "heights of no stated datum"
+    vertical: Vertical = "assume-same"
+    height_notes: tuple[str, ...] = ()
+    unit_notes: tuple[str, ...] = ()
+    grid_scale: tuple[float, float] | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """All that had to be assumed, a sentence each."""
+        return (*self.unit_notes, *self.height_notes)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what goes into ``transform.json`` and ``run.json``; a grid scale only where it is known."""
+        known: dict[str, Any] = {
+            "operation": self.operation,
+            "accuracy_m": self.accuracy_m,
+            "grids": list(self.grids),
+            "heights": self.heights,
+            "vertical": self.vertical,
+            "notes": list(self.notes),
+        }
+        return known if self.grid_scale is None else known | {"grid_scale": list(self.grid_scale)}
+
+
+@dataclass(frozen=True, eq=False)
+class FrameLink(ComparesArrays):
+    """The conversion between a file's coordinates and work coordinates of its side.
 
     File coordinates go through a PROJ pipeline where the CRSs differ, are multiplied by a factor where
     the units do, and are shifted by the origin.
@@ -48,6 +93,8 @@ class FrameLink:
         pipeline: PROJ pipeline from the file's CRS to the work frame's, or None.
         bounds: (2, 3) file coordinates in which the link is used; needed with a pipeline only.
         report: the operation by name, its accuracy and grids, and what had to be assumed.
+        georeferenced: whether the file's CRS is tied to the earth, so that its vertical and its place are
+            known. False for local coordinates, and for an engineering CRS, which has a name but no place.
 
     """
 
@@ -56,7 +103,8 @@ class FrameLink:
     factor: Floats = field(default_factory=lambda: np.ones(3))
     pipeline: str | None = None
     bounds: Floats | None = None
-    report: dict[str, Any] = field(default_factory=dict)
+    report: OperationReport = field(default_factory=OperationReport)
+    georeferenced: bool = False
 
     def to_work(self, xyz: Floats) -> Floats:
         """Take (n, 3) file coordinates to (n, 3) work coordinates in metres.
@@ -129,7 +177,7 @@ def run_pipeline(pipeline: str, xyz: Floats, inverse: bool = False) -> Floats:
     """Take (n, 3) coordinates through a PROJ pipeline, or back.
 
     Raises:
-        CrsError: if PROJ does not know the pipeline, or it does not reach some point.
+        CrsError: if PROJ does not know the pipeline, or it is not defined at some point.
 
     """
     from pyproj.enums import TransformDirection
@@ -170,7 +218,7 @@ def fit_affine(move: Callable[[Floats], Floats], bounds: Floats, steps: int = 5)
     unit = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     moved = move(middle + unit * half)
     centre = moved.mean(axis=0)
-    # on a symmetric grid the columns are orthogonal: no solver is needed, and no digit is lost
+    # on a symmetric grid the columns are orthogonal: no solver is needed, and no precision is lost
     A = ((moved - centre).T @ unit) / (unit**2).sum(axis=0)
     worst = float(np.linalg.norm(moved - centre - unit @ A.T, axis=1).max())
     T = np.eye(4)

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import ComparesArrays, Grey, Mask
 from mtpcr_geo.core.arrays import Floats as Floats
-from mtpcr_geo.core.arrays import Grey, Mask
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.grid import Grid
 
@@ -23,27 +23,6 @@ IcpMethod = Literal["gicp", "point_to_plane", "point_to_point"]
 LevellingMethod = Literal["none", "plane", "verticals"]
 Look = Literal["band_pass", "paper", "paper_normalised", "grey", "grey_printed"]
 """How the image of a raster is made that keypoint matchers see, see `mtpcr_geo.method.images.image_of`."""
-
-
-class ComparesArrays:
-    """Compares dataclasses field by field, arrays exactly (NaN equal to NaN); instances have no hash."""
-
-    def __eq__(self, other: object) -> bool:
-        """Return whether both are of one class and every field is equal."""
-        if type(self) is not type(other):
-            return NotImplemented
-        names = [one.name for one in fields(self)]  # type: ignore[arg-type]
-        return all(_equal(getattr(self, name), getattr(other, name)) for name in names)
-
-    __hash__ = None  # type: ignore[assignment]
-
-
-def _equal(a: object, b: object) -> bool:
-    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        if not (isinstance(a, np.ndarray) and isinstance(b, np.ndarray)):
-            return False
-        return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
-    return bool(a == b)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The whole way of a point: source file, work frame, rigid transform, work frame, target file."""
+"""The whole conversion of a point: source file, work frame, rigid transform, work frame, target file."""
 
 from __future__ import annotations
 
@@ -6,21 +6,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import ComparesArrays, Floats
 from mtpcr_geo.core.frames import FrameLink, box_points, fit_affine
-from mtpcr_geo.crs.facts import facts_of
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.types import Pair
 
-Floats = NDArray[np.float64]
 
-
-@dataclass(frozen=True)
-class TransformChain:
-    """A registration's result, ready to move points either way without losing digits far from the origin.
+@dataclass(frozen=True, eq=False)
+class TransformChain(ComparesArrays):
+    """A registration's result, ready to move points either way at full precision far from the origin.
 
     Attributes:
         source: between source file coordinates and source work coordinates.
@@ -39,7 +36,7 @@ class TransformChain:
 
     @classmethod
     def of(cls, pair: Pair) -> TransformChain:
-        """Take the chain of a solved pair.
+        """Return the chain of a solved pair.
 
         Raises:
             ValueError: if the pair has no transform yet.
@@ -69,7 +66,7 @@ class TransformChain:
     @property
     def shift_m(self) -> Floats | None:
         """(3,) metres by which the pivot leaves the place that its CRS claims; None for a local source."""
-        if any(facts_of(link.file_crs).kind == "local" for link in (self.source, self.target)):
+        if not (self.source.georeferenced and self.target.georeferenced):
             return None
         before = self.source.to_work(self.pivot[None])
         after = transforms.apply(self.T_target_source, before)
@@ -79,7 +76,7 @@ class TransformChain:
     def vertical_offset_m(self) -> float | None:
         """Metres added to the source's heights, where that was to be estimated; None elsewhere."""
         shift = self.shift_m
-        if shift is None or self.source.report.get("vertical") != "estimate":
+        if shift is None or self.source.report.vertical != "estimate":
             return None
         return float(shift[2])
 
@@ -90,7 +87,7 @@ class TransformChain:
 
     @property
     def is_affine(self) -> bool:
-        """Return whether one 4x4 on file coordinates says the same as the chain."""
+        """Return whether one 4x4 on file coordinates is exactly the chain."""
         return self.source.pipeline is None and self.target.pipeline is None
 
     @property

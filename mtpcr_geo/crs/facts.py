@@ -1,4 +1,4 @@
-"""What a coordinate reference system says about the numbers in a file: kind, units, height, datum."""
+"""What a coordinate reference system states about coordinates: kind, units, height, datum."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class CrsFacts:
         horizontal: the horizontal part, two axes; a bound one keeps its shift parameters. None if local.
         unit: metres a horizontal unit (projected, geocentric, local), or degrees a unit (geographic).
         unit_name: of the horizontal unit.
-        height: heights above a named vertical datum, above the ellipsoid, or nothing said.
+        height: heights above a named vertical datum, above the ellipsoid, or nothing stated ("unsaid").
         vertical: the vertical CRS where there is one.
         height_unit: metres a unit of height.
         height_unit_name: of the unit of height.
@@ -45,12 +45,17 @@ class CrsFacts:
 
     @property
     def name(self) -> str:
-        """What to call it in messages."""
+        """Return what to call it in messages."""
         return "local coordinates" if self.crs is None else self.crs.name
 
     @property
+    def georeferenced(self) -> bool:
+        """Return whether it is tied to the earth: neither local coordinates nor an engineering system."""
+        return self.kind != "local"
+
+    @property
     def height_name(self) -> str:
-        """What its heights refer to, in words."""
+        """Return what its heights refer to."""
         if self.vertical is not None:
             return str(self.vertical.name)
         if self.height == "ellipsoidal":

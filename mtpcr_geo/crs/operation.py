@@ -1,23 +1,22 @@
-"""Choosing the way from one CRS to another: the best there is, never a worse one in silence."""
+"""Coordinate operations between CRSs: the most accurate one, never a lesser one unreported."""
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError
+from mtpcr_geo.core.frames import OperationReport
 
 if TYPE_CHECKING:
     from pyproj import CRS
     from pyproj.transformer import AreaOfInterest
 
     from mtpcr_geo.crs.facts import CrsFacts
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -38,13 +37,13 @@ class Operation:
     grids: tuple[str, ...]
 
     @property
-    def report(self) -> dict[str, Any]:
-        """The operation in words and numbers, for the record."""
-        return {"operation": self.name, "accuracy_m": self.accuracy, "grids": list(self.grids)}
+    def report(self) -> OperationReport:
+        """The operation by name, accuracy and grids, for the audit."""
+        return OperationReport(self.name, self.accuracy, self.grids)
 
 
 def best_operation(start: CRS, end: CRS, area: AreaOfInterest | None) -> Operation:
-    """Find the most accurate operation for an area, and refuse to take a lesser one.
+    """Return the most accurate operation for an area, and refuse to take a lesser one.
 
     Args:
         start: the CRS to come from.
@@ -64,7 +63,7 @@ def best_operation(start: CRS, end: CRS, area: AreaOfInterest | None) -> Operati
             warnings.simplefilter("ignore", UserWarning)
             group = TransformerGroup(start, end, always_xy=True, area_of_interest=area, allow_ballpark=False)
     except ProjError as error:
-        raise CrsError(f"PROJ knows no way from {start.name} to {end.name}: {error}") from error
+        raise CrsError(f"PROJ knows no operation from {start.name} to {end.name}: {error}") from error
     if not group.best_available and group.unavailable_operations:
         missing = [
             grid.short_name
@@ -74,13 +73,13 @@ def best_operation(start: CRS, end: CRS, area: AreaOfInterest | None) -> Operati
         ]
         names = ", ".join(missing) or "a grid"
         raise CrsError(
-            f"the way from {start.name} to {end.name} needs {names}, which is not installed; "
+            f"the operation from {start.name} to {end.name} needs {names}, which is not installed; "
             f"fetch it with 'pyproj sync --file {(missing or ['...'])[0]}', or reproject one of them first"
         )
     if not group.transformers:
         raise CrsError(
-            f"PROJ knows no way from {start.name} to {end.name}; reproject one of them first, "
-            "or say what its CRS is"
+            f"PROJ knows no operation from {start.name} to {end.name}; reproject one of them first, "
+            "or name its CRS"
         )
     best = group.transformers[0]
     definition = str(best.definition)
@@ -96,7 +95,7 @@ def best_operation(start: CRS, end: CRS, area: AreaOfInterest | None) -> Operati
 
 
 def area_of(facts: CrsFacts, points: Floats) -> AreaOfInterest | None:
-    """Find the area in degrees that (n, 3) coordinates of a CRS cover; None where they are beyond it."""
+    """Return the area in degrees that (n, 3) coordinates of a CRS cover; None where they are beyond it."""
     from pyproj import Transformer
     from pyproj.transformer import AreaOfInterest
 
@@ -121,7 +120,7 @@ def area_of(facts: CrsFacts, points: Floats) -> AreaOfInterest | None:
 def grid_scale(crs: CRS, area: AreaOfInterest) -> tuple[float, float] | None:
     """Return how long a metre of a projected CRS is drawn in the middle of an area, at least and at most.
 
-    None where PROJ cannot tell.
+    None where PROJ has no answer.
     """
     from pyproj import Proj
     from pyproj.exceptions import ProjError
@@ -149,7 +148,7 @@ def geographic_of(crs: CRS) -> CRS:
 
 
 def local_projection(facts: CrsFacts, area: AreaOfInterest) -> CRS:
-    """Make a transverse Mercator of true scale in the middle of an area, on the same datum, in metres.
+    """Return a transverse Mercator of true scale in the middle of an area, on the same datum, in metres.
 
     The middle is rounded to hundredths of a degree: scale stays within 1e-8 of true, and the name is short.
     """

@@ -1,15 +1,15 @@
-"""Settling in which frame two clouds are registered, and how each comes there and back."""
+"""The frame in which two clouds are registered, and how each is converted to it and back."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError, InputError
-from mtpcr_geo.core.frames import FrameLink, WorkFrame, box_points, run_pipeline
+from mtpcr_geo.core.frames import FrameLink, OperationReport, Vertical, WorkFrame, box_points, run_pipeline
 from mtpcr_geo.crs.facts import CrsFacts, facts_of, metric, same_datum, same_heights, same_place, unbound
 from mtpcr_geo.crs.operation import area_of, best_operation, grid_scale, local_projection
 
@@ -18,15 +18,13 @@ if TYPE_CHECKING:
 
     from mtpcr_geo.core.cloud import Cloud
 
-Floats = NDArray[np.float64]
-Vertical = Literal["refuse", "assume-same", "estimate"]
 LOCAL = "local"
 SCALE_NOTED, SCALE_REFUSED = 0.002, 0.01  # departure of a map's metre from a metre on the ground
 FARTHEST_APART = 100_000.0  # metres between the bounds of two clouds that both claim a place on earth
 
 
 def parse_crs(text: str) -> CRS | None:
-    """Read what a user says of a CRS: ``EPSG:25832``, WKT, a PROJ string, or ``local``.
+    """Return the CRS that a text names: ``EPSG:25832``, WKT, a PROJ string, or ``local``.
 
     Returns:
         The CRS, or None for ``local``.
@@ -44,7 +42,7 @@ def parse_crs(text: str) -> CRS | None:
         return CRS.from_user_input(text)
     except CRSError as error:
         raise CrsError(
-            f"{text!r} is not a coordinate reference system; say for example EPSG:25832, EPSG:7415 or local"
+            f"{text!r} is not a coordinate reference system; give for example EPSG:25832, EPSG:7415 or local"
         ) from error
 
 
@@ -58,7 +56,7 @@ def resolve_frames(
     vertical: Vertical = "refuse",
     out_crs: str | CRS | None = None,
 ) -> tuple[WorkFrame, FrameLink, FrameLink]:
-    """Settle in which frame two clouds are registered, and how each comes there.
+    """Return the frame in which two clouds are registered, and how each is converted to it.
 
     The work frame is the target's projection in metres, or for geographic and geocentric targets a
     transverse Mercator of true scale in their middle; its heights are the target's, in metres. The source
@@ -68,12 +66,12 @@ def resolve_frames(
     Args:
         target: the cloud that stays; its CRS is what its file or reader states.
         source: the cloud that moves, likewise.
-        target_crs: what the user says of the target instead: a CRS, its text, or "local".
-        source_crs: what the user says of the source instead.
-        local: both clouds are local, in metres, whatever the files say.
+        target_crs: the CRS to use for the target instead: a CRS, its text, or "local".
+        source_crs: the same for the source.
+        local: both clouds are local, in metres, whatever the files state.
         vertical: what to do where heights have different or unknown datums: "refuse"; "assume-same" takes
             them as equal; "estimate" takes them as they are and leaves the offset to the registration.
-        out_crs: CRS of the result where it shall not be the target's.
+        out_crs: CRS of the result where that is not the target's.
 
     Returns:
         The work frame (with the way out to `out_crs` as its `output`), the target's and the source's link.
@@ -89,14 +87,14 @@ def resolve_frames(
 
     work = _work_crs(target_facts, target_bounds)
     target_link = _link(target_facts, work, target_facts, target_bounds, "assume-same")
-    if target_facts.kind == "local" or source_facts.kind == "local":
+    if not (target_facts.georeferenced and source_facts.georeferenced):
         source_work = _work_crs(source_facts, source_bounds)
         source_link = _link(source_facts, source_work, source_facts, source_bounds, "assume-same")
-        _note_scale(source_link, source_facts, source_work, beside_local=True)
-        _note_scale(target_link, target_facts, work, beside_local=True)
+        source_link = _with_scale(source_link, source_facts, source_work, beside_local=True)
+        target_link = _with_scale(target_link, target_facts, work, beside_local=True)
     else:
         source_link = _link(source_facts, work, target_facts, source_bounds, vertical)
-        _note_scale(target_link, target_facts, work, beside_local=False)
+        target_link = _with_scale(target_link, target_facts, work, beside_local=False)
         _require_near(target_link, source_link)
     frame = WorkFrame(None if work is None else unbound(work), target_link.origin)
     if out_crs is not None:
@@ -104,12 +102,12 @@ def resolve_frames(
     return frame, target_link, source_link
 
 
-def _claimed(cloud: Cloud, said: str | CRS | None, role: str) -> CRS | None:
-    if isinstance(said, str):
-        return parse_crs(said)
-    crs = cloud.crs if said is None else said
+def _claimed(cloud: Cloud, declared: str | CRS | None, role: str) -> CRS | None:
+    if isinstance(declared, str):
+        return parse_crs(declared)
+    crs = cloud.crs if declared is None else declared
     if crs is None:
-        problem = getattr(cloud, "crs_problem", "") or "it says none"
+        problem = getattr(cloud, "crs_problem", "") or "it states none"
         raise CrsError(
             f"the {role} {cloud.name} has no coordinate reference system ({problem}); "
             f"give --{role}-crs EPSG:..., or --{role}-crs local (--local for both clouds) "
@@ -146,22 +144,28 @@ def _work_crs(facts: CrsFacts, bounds: Floats) -> CRS | None:
 def _link(
     facts: CrsFacts, work: CRS | None, heights: CrsFacts, bounds: Floats, vertical: Vertical
 ) -> FrameLink:
-    """Find the way from a cloud's CRS to the horizontal work CRS and the heights of another CRS."""
+    """Return the link from a cloud's CRS to the horizontal work CRS and the heights of another CRS."""
     factor = np.array([facts.unit, facts.unit, facts.height_unit])
     pipeline: str | None = None
-    report: dict[str, Any] = {"operation": "units only", "accuracy_m": 0.0, "grids": []}
-    notes = _unit_notes(facts)
+    report = OperationReport()
+    height_notes: list[str] = []
     if work is not None and facts.horizontal is not None:
-        agree = _heights_agree(facts, heights, vertical, notes)
+        agree = _heights_agree(facts, heights, vertical, height_notes)
         start, end, solid = _ends(facts, work, heights, agree)
         if solid or facts.kind != "projected" or not same_place(metric(facts.horizontal), work):
             operation = best_operation(start, end, area_of(facts, box_points(bounds, 2)))
             pipeline, report = operation.pipeline, operation.report
             factor = np.ones(3) if solid else np.array([1.0, 1.0, facts.height_unit])
     if factor[:2].tolist() == [1.0, 1.0] and factor[2] == 1.0 and pipeline is None:
-        report["operation"] = "none: the file is in the work frame's metres"
-    report |= {"heights": facts.height_name, "vertical": vertical, "notes": notes}
-    link = FrameLink(facts.crs, np.zeros(3), factor, pipeline, bounds, report)
+        report = replace(report, operation="none: the file is in the work frame's metres")
+    report = replace(
+        report,
+        heights=facts.height_name,
+        vertical=vertical,
+        height_notes=tuple(height_notes),
+        unit_notes=_unit_notes(facts),
+    )
+    link = FrameLink(facts.crs, np.zeros(3), factor, pipeline, bounds, report, facts.georeferenced)
     return replace(link, origin=_origin(link, bounds))
 
 
@@ -197,15 +201,15 @@ def _heights_agree(facts: CrsFacts, other: CrsFacts, vertical: Vertical, notes: 
         raise CrsError(
             f"heights do not go together: {facts.height_name} in {facts.name}, "
             f"{other.height_name} in {other.name}; name a CRS with its vertical part (such as EPSG:7415), "
-            "or say --vertical assume-same or --vertical estimate"
+            "or give --vertical assume-same or --vertical estimate"
         )
     return False
 
 
-def _unit_notes(facts: CrsFacts) -> list[str]:
-    if facts.crs is None or facts.height != "unsaid" or facts.kind == "local":
-        return []
-    return [f"the CRS states no unit of height: taken as {facts.height_unit_name}"]
+def _unit_notes(facts: CrsFacts) -> tuple[str, ...]:
+    if facts.height != "unsaid" or not facts.georeferenced:
+        return ()
+    return (f"the CRS states no unit of height: taken as {facts.height_unit_name}",)
 
 
 def _origin(link: FrameLink, bounds: Floats) -> Floats:
@@ -218,29 +222,32 @@ def _origin(link: FrameLink, bounds: Floats) -> Floats:
     return np.asarray(np.floor(middle + 0.123456))
 
 
-def _note_scale(link: FrameLink, facts: CrsFacts, work: CRS | None, beside_local: bool) -> None:
-    """Record how true the metres of the work frame are; a local cloud has true ones, which must go with them.
+def _with_scale(link: FrameLink, facts: CrsFacts, work: CRS | None, beside_local: bool) -> FrameLink:
+    """Add to a link's report how true the metres of the work frame are.
+
+    A local cloud has metres of the ground, which must go with them.
 
     Raises:
         CrsError: if a local cloud would have to be stretched.
 
     """
     if work is None or facts.kind != "projected" or link.bounds is None:
-        return
+        return link
     area = area_of(facts, box_points(link.bounds, 2))
     scale = None if area is None else grid_scale(unbound(work), area)
     if scale is None:
-        return
-    link.report["grid_scale"] = list(scale)
+        return link
     worst = max(scale, key=lambda one: abs(one - 1.0))
-    said = f"a metre on the ground is {worst:.4f} m in {facts.name} here"
+    stretch = f"a metre on the ground is {worst:.4f} m in {facts.name} here"
     if beside_local and abs(worst - 1.0) > SCALE_REFUSED:
         raise CrsError(
-            f"{said}, and a local cloud has metres of the ground: no rigid transform fits both; "
+            f"{stretch}, and a local cloud has metres of the ground: no rigid transform fits both; "
             "reproject the other one to a system of true scale, such as its UTM zone"
         )
+    notes = link.report.unit_notes
     if abs(worst - 1.0) > SCALE_NOTED:
-        link.report["notes"].append(f"{said}: distances in metres are off by that")
+        notes = (*notes, f"{stretch}: distances in metres are off by that")
+    return replace(link, report=replace(link.report, unit_notes=notes, grid_scale=scale))
 
 
 def _require_near(target: FrameLink, source: FrameLink) -> None:
@@ -256,15 +263,15 @@ def _require_near(target: FrameLink, source: FrameLink) -> None:
     if distance > FARTHEST_APART:
         raise CrsError(
             f"by their CRSs, source and target lie {distance / 1000:.0f} km apart; check that they show the "
-            "same place, or say --source-crs local if the source's coordinates are not in its CRS"
+            "same place, or give --source-crs local if the source's coordinates are not in its CRS"
         )
 
 
 def _output(
-    said: str | CRS, frame: WorkFrame, target: FrameLink, target_facts: CrsFacts, vertical: Vertical
+    declared: str | CRS, frame: WorkFrame, target: FrameLink, target_facts: CrsFacts, vertical: Vertical
 ) -> FrameLink:
-    """Find the way from the target's work coordinates to a CRS that the user wants."""
-    crs = parse_crs(said) if isinstance(said, str) else said
+    """Return the link from the target's work coordinates to a CRS that the user wants."""
+    crs = parse_crs(declared) if isinstance(declared, str) else declared
     if crs is None or frame.crs is None or target_facts.horizontal is None or target.bounds is None:
         raise CrsError(
             "--out-crs needs a target with a coordinate reference system, and one to go to; "

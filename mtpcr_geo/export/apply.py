@@ -15,11 +15,11 @@ from mtpcr_geo.io.views import Moved
 from mtpcr_geo.io.write import returning_scales, write_cloud
 
 if TYPE_CHECKING:
+    from mtpcr_geo.core.arrays import Floats
     from mtpcr_geo.core.cloud import Cloud
-    from mtpcr_geo.core.types import Floats
+    from mtpcr_geo.core.progress import Progress
     from mtpcr_geo.crs.chain import TransformChain
     from mtpcr_geo.io.memory import CloudLike
-    from mtpcr_geo.pipeline.stage import Progress
 
 
 def apply_transform(
@@ -32,12 +32,12 @@ def apply_transform(
 ) -> Path:
     """Stream a cloud through a transform into a new LAS, LAZ or COPC file.
 
-    The output's last digit is finer than the input's, so that moving there and back returns every point.
+    The output's storage step is finer than the input's, so that moving there and back returns every point.
 
     Args:
         transform_path: a ``transform.json``.
         in_path: a cloud in the source's frame (in the target's with `inverse`).
-        out_path: where to write; the suffix says the format.
+        out_path: where to write; the suffix is the format.
         inverse: go from target to source.
         overwrite: whether `out_path` may be replaced.
         progress: where to report the points written.

@@ -8,15 +8,14 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.export import drawing
-
-Floats = NDArray[np.float64]
 
 _WIDTH = 640
 
 
 def bars(values: Sequence[float], labels: Sequence[str], notes: Sequence[str] = ()) -> str:
-    """Draw horizontal bars, the first one highlighted.
+    """Return horizontal bars, the first one highlighted.
 
     Args:
         values: lengths, none negative.
@@ -40,13 +39,13 @@ def bars(values: Sequence[float], labels: Sequence[str], notes: Sequence[str] = 
     return _svg(_WIDTH, max(len(values), 1) * row, parts)
 
 
-def histogram(residual_m: Floats, inlier: NDArray[np.bool_], limit_m: float, bins: int = 32) -> str:
-    """Draw how many tie points have which residual: agreeing ones green, the others red, stacked.
+def histogram(residual_m: Floats, inlier: Mask, limit_m: float, bins: int = 32) -> str:
+    """Return a histogram of the residuals of tie points: agreeing ones green, the others red, stacked.
 
     Args:
-        residual_m: (n,) misfits in metres.
+        residual_m: (n,) residuals in metres.
         inlier: (n,) which agree with the transform.
-        limit_m: where the axis ends; larger misfits are counted in the last bar.
+        limit_m: where the axis ends; larger residuals are counted in the last bar.
 
     """
     height, base, left = 190, 160, 36
@@ -81,7 +80,7 @@ def histogram(residual_m: Floats, inlier: NDArray[np.bool_], limit_m: float, bin
 def residual_map(
     target: Floats, registered: Floats, colours: NDArray[np.uint8], rings: dict[str, Floats]
 ) -> str:
-    """Draw tie points in plan, coloured by residual, with the residual itself as a line, enlarged.
+    """Return tie points in plan, coloured by residual, with the residual itself as a line, enlarged.
 
     Args:
         target: (n, 3) target ends in metres.
@@ -125,7 +124,7 @@ def residual_map(
     y = height - 22
     parts.append(
         f'<path d="M10 {y:.0f}h{bar * scale:.1f}" stroke="currentColor" stroke-width="2"/>'
-        f'<text x="10" y="{y + 17:.0f}">{bar:g} m; misfits drawn {enlarge:g} times enlarged</text>'
+        f'<text x="10" y="{y + 17:.0f}">{bar:g} m; residuals drawn {enlarge:g} times their length</text>'
     )
     return _svg(_WIDTH, height, parts)
 

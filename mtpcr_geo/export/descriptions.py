@@ -1,4 +1,4 @@
-"""What a run came to, in words and rows, for the report and the recording alike."""
+"""The result of a run as rows of text, for the report, the recording and the terminal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.types import Floats, IcpResult, Pair, Side, Verdict
+from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.types import IcpResult, Pair, Side, Verdict
 from mtpcr_geo.crs import FrameLink, TransformChain, facts_of
 from mtpcr_geo.export.tie_points import tie_positions
 from mtpcr_geo.export.transform import units_of
@@ -19,31 +20,55 @@ Row = tuple[str, str]
 
 _MEANING = {
     "accepted": "The source fits the target; the checks that did not take part in the fit agree.",
-    "doubtful": "A transform was found, but the checks leave room for doubt: look at it before use.",
+    "doubtful": "A transform was found, but the checks leave room for doubt: inspect it before use.",
     "refused": "The checks speak against the transform; no registered cloud is written unless forced.",
+}
+_LABELS = {
+    "held_out_tie_points": "held-out tie points",
+    "held_out_agreeing": "held-out tie points that agree",
+    "held_out_agreeing_share": "share of held-out tie points that agree",
+    "held_out_tolerance_m": "agreeing within",
+    "held_out_median_m": "median residual of held-out tie points, plan",
+    "neg_log10_p": "significance of that (-log10 p)",
+    "hypothesis_margin": "times stronger than the next distinct pose",
+    "patch_support": "patches that agree on the pose",
+    "overlap_m2": "ground that both see",
+    "overlap_source": "overlap, share of the source",
+    "overlap_target": "overlap, share of the target",
+    "ground_cells": "ground that both see, cells compared",
+    "ground_agreeing": "of these, cells with heights within 0.5 m",
+    "refined_away_m": "moved by the refinement",
+    "vertical_offset_m": "height offset found",
+    "yaw_deg": "yaw, work frame",
+    "tilt_deg": "tilt, work frame",
+    "shift_work_m": "translation, work frame",
+    "tie_points_agreeing": "tie points that agree with the final transform",
+    "sigma_yaw_deg": "standard deviation of yaw",
+    "sigma_plan_m": "standard deviation in plan",
+    "sigma_plan_source_centroid_m": "standard deviation in plan, middle of the source",
 }
 _UNITS = (("_m2", "m²"), ("_m", "m"), ("_deg", "°"), ("_s", "s"), ("_mb", "MB"), ("_cells", "cells"))
 _SHARES = ("_share", "overlap_source", "overlap_target", "_support")
 
 
 def verdict_meaning(verdict: Verdict) -> str:
-    """Say in a sentence what a verdict means for the user."""
+    """Return in a sentence what a verdict means for the user."""
     return _MEANING[verdict.name]
 
 
 def metric_rows(metrics: Mapping[str, Any]) -> list[Row]:
-    """Return numbers as (name in words, value with its unit), read from the unit in each name."""
+    """Return metrics as (label, value with its unit); the unit is read from the end of each key."""
     rows = []
     for key, value in metrics.items():
         if isinstance(value, Mapping):
-            rows += [(f"{_words(key)}: {name}", text) for name, text in metric_rows(value)]
+            rows += [(f"{_label(key)}: {name}", text) for name, text in metric_rows(value)]
         else:
             rows.append(_metric_row(key, value))
     return rows
 
 
 def side_rows(side: Side) -> list[Row]:
-    """Say what a cloud is: file, points, CRS, extent, how it was levelled, its raster."""
+    """Return the facts of a cloud: file, points, CRS, extent, levelling, raster."""
     cloud = side.cloud
     crs = side.link.file_crs.name if side.link.file_crs is not None else "none (local coordinates)"
     extent = np.ptp(side.sample, axis=0) if len(side.sample) else np.zeros(3)
@@ -52,12 +77,13 @@ def side_rows(side: Side) -> list[Row]:
         ("points", f"{cloud.count:,}"),
         ("CRS", crs),
         ("units", units_text(side.link)),
-        *_way_rows(side.link),
+        *_operation_rows(side.link),
         ("extent", f"{extent[0]:.1f} × {extent[1]:.1f} m, {extent[2]:.1f} m high"),
-        ("work origin", ", ".join(f"{value:.0f}" for value in side.link.origin) + " m"),
+        ("origin of the work frame", ", ".join(f"{value:.0f}" for value in side.link.origin) + " m"),
     ]
     tilt = math.degrees(transforms.rotation_angle(side.T_level_work[:3, :3]))
-    rows.append(("levelling", f"turned by {tilt:.2f}°" if tilt > 0 else "left upright"))
+    kept = f"none: {side.levelling.why or 'upright'}"
+    rows.append(("levelling", f"rotated by {tilt:.2f}°" if tilt > 0 else kept))
     if side.bev is not None:
         grid = side.bev.grid
         share = float(np.count_nonzero(side.bev.count)) / max(side.bev.count.size, 1)
@@ -66,7 +92,7 @@ def side_rows(side: Side) -> list[Row]:
 
 
 def transform_rows(pair: Pair) -> list[Row]:
-    """Say what the transform does: yaw, tilt, how the middle of the source moves, how tie points fit."""
+    """Return what the transform does: yaw, tilt, shift of the source's middle, residuals of tie points."""
     if pair.T_target_source is None:
         return []
     R = pair.T_target_source[:3, :3]
@@ -75,18 +101,20 @@ def transform_rows(pair: Pair) -> list[Row]:
     rows = [("yaw", f"{math.degrees(yaw):+.4f}° (counter-clockwise from above)"), ("tilt", f"{tilt:.4f}°")]
     moved = shift_text(pair)
     if moved:
-        rows.append(("the middle moves by", moved))
+        rows.append(("shift of the source's middle", moved))
     rows.append(("result in", result_text(pair)))
     offset = TransformChain.of(pair).vertical_offset_m
     if offset is not None:
         rows.append(("height offset found", f"{offset:+.3f} m, added to the source's heights"))
     if pair.tie_points is not None and len(pair.tie_points.target):
         inlier = np.asarray(pair.tie_points.inlier, bool)
-        rows.append(("tie_points", f"{len(inlier)}, of which {int(inlier.sum())} agree with the transform"))
+        rows.append(("tie points", f"{len(inlier)}, of which {int(inlier.sum())} agree with the transform"))
         if inlier.any():
             off = surface_residuals(pair)[inlier]
             plan, height = np.median(np.hypot(off[:, 0], off[:, 1])), np.median(np.abs(off[:, 2]))
-            rows.append(("residual of those", f"median {plan:.2f} m in plan, {height:.2f} m in height"))
+            rows.append(
+                ("residual of the agreeing ones", f"median {plan:.2f} m in plan, {height:.2f} m in height")
+            )
     icp = pair.refinement.icp if pair.refinement is not None else None
     if icp is not None:
         rows.append(("refined by", refinement_text(icp)))
@@ -108,14 +136,14 @@ def refinement_text(icp: IcpResult) -> str:
 
 
 def units_text(link: FrameLink) -> str:
-    """Name the units of a file's coordinates, across and up, and what its heights count from."""
+    """Return the units of a file's coordinates, in plan and height, and what its heights refer to."""
     across, _, up = units_of(link)
-    units = across if across == up else f"{across} across, {up} up"
+    units = across if across == up else f"{across} in plan, {up} in height"
     return f"{units}; {facts_of(link.file_crs).height_name}"
 
 
 def shift_text(pair: Pair) -> str:
-    """Say how far the source's middle moves: metres in the work frame, or in the files' local frame.
+    """Return how far the source's middle moves: metres in the work frame, or in the clouds' local frame.
 
     Empty where source and target share no frame, so that no shift has a meaning.
     """
@@ -123,35 +151,34 @@ def shift_text(pair: Pair) -> str:
     shift = chain.shift_m
     if shift is not None and pair.frame.crs is not None:
         return f"{_numbers(shift, 3, sign=True)} m (east, north, up in {pair.frame.crs.name})"
-    if pair.source.link.file_crs is None and pair.target.link.file_crs is None:
-        shift = chain.forward(chain.pivot[None])[0] - chain.pivot
+    if not (pair.source.link.georeferenced or pair.target.link.georeferenced):
+        moved = chain.forward(chain.pivot[None])[0]
+        shift = moved * chain.target.factor - chain.pivot * chain.source.factor
         return f"{_numbers(shift, 3, sign=True)} m (x, y, z)"
     return ""
 
 
 def result_text(pair: Pair) -> str:
-    """Name the CRS and the units of the registered cloud."""
+    """Return the CRS and the units of the registered cloud."""
     link = pair.frame.output or pair.target.link
     name = link.file_crs.name if link.file_crs is not None else "local coordinates of the target"
     return f"{name}: {units_text(link)}"
 
 
-def _way_rows(link: FrameLink) -> list[Row]:
-    """Say how a file's coordinates come to the work frame, and what had to be assumed."""
+def _operation_rows(link: FrameLink) -> list[Row]:
+    """Return how a file's coordinates come to the work frame, and what had to be assumed."""
     report = link.report
-    rows = []
-    if "operation" in report:
-        accuracy = report.get("accuracy_m")
-        how = "accuracy not stated" if accuracy is None else f"good to {accuracy:g} m"
-        grids = ", ".join(report.get("grids", ()))
-        rows.append(("way to the work frame", f"{report['operation']} ({how}{'; ' if grids else ''}{grids})"))
-    return rows + [("note", note) for note in report.get("notes", ())]
+    accuracy = report.accuracy_m
+    how = "accuracy not stated" if accuracy is None else f"accuracy {accuracy:g} m"
+    details = f" ({'; '.join([how, *report.grids])})" if link.pipeline is not None else ""
+    rows = [("conversion to the work frame", report.operation + details)]
+    return rows + [("note", note) for note in report.notes]
 
 
 def worked_example(pair: Pair) -> tuple[Floats, Floats] | None:
     """Return one point, the middle of the source, before and after: (3,) source and target file coordinates.
 
-    The way goes through the whole chain, not through the single 4x4, so it can serve to check that.
+    It is moved by the whole chain, not by the single 4x4, so it can serve to check that.
     """
     if pair.T_target_source is None:
         return None
@@ -167,7 +194,7 @@ def surface_residuals(pair: Pair) -> Floats:
 
 
 def hypothesis_rows(pair: Pair) -> list[tuple[str, ...]]:
-    """Return the candidate poses as (rank, yaw, shift, score, overlap) in words, best first."""
+    """Return the candidate poses as texts (rank, yaw, shift, score, overlap), best first."""
     if pair.matches is None:
         return []
     cell = pair.target.bev.grid.cell if pair.target.bev is not None else math.nan
@@ -211,22 +238,22 @@ def markdown_table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 def _metric_row(key: str, value: Any) -> Row:
     if value is None:
-        return _words(key), "not known"
+        return _label(key), "not known"
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, bool):
-        return _words(key), "yes" if value else "no"
+        return _label(key), "yes" if value else "no"
     if isinstance(value, list | tuple | np.ndarray) and key.endswith("_m"):
-        return _words(key.removesuffix("_m")), f"{_numbers(np.asarray(value), 3)} m"
+        return _label(key, "_m"), f"{_numbers(np.asarray(value), 3)} m"
     if not isinstance(value, int | float):
-        return _words(key), plain(value)
+        return _label(key), plain(value)
     if key.endswith(_SHARES):
-        return _words(key), f"{100 * float(value):.1f} %"
+        return _label(key), f"{100 * float(value):.1f} %"
     for suffix, unit in _UNITS:
         if key.endswith(suffix):
             gap = "" if unit == "°" else " "
-            return _words(key.removesuffix(suffix)), f"{_short(value)}{gap}{unit}"
-    return _words(key), _short(value)
+            return _label(key, suffix), f"{_short(value)}{gap}{unit}"
+    return _label(key), _short(value)
 
 
 def _short(value: float) -> str:
@@ -235,8 +262,9 @@ def _short(value: float) -> str:
     return f"{value:,.1f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
-def _words(key: str) -> str:
-    return key.replace("_", " ")
+def _label(key: str, suffix: str = "") -> str:
+    """Return what a metric is called; the keys are explained in `mtpcr_geo.export.run_json`."""
+    return _LABELS.get(key) or key.removesuffix(suffix).replace("_", " ")
 
 
 def _numbers(values: Floats, digits: int, sign: bool = False) -> str:

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats, Image, Mask
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Pair
 from mtpcr_geo.export.geotiff import grid_around, warp_bev
 
-Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 SOURCE_RGB = (240, 120, 20)
@@ -18,7 +18,7 @@ TARGET_RGB = (50, 130, 220)
 GOOD_RGB = (40, 190, 90)
 FAIR_RGB = (250, 190, 60)
 BAD_RGB = (220, 50, 40)
-WITHHELD_RGB = (70, 170, 255)
+HELD_OUT_RGB = (70, 170, 255)
 UNJUDGED_RGB = (250, 220, 80)
 EMPTY_RGB = (32, 34, 40)
 
@@ -27,8 +27,8 @@ _LOCAL_MEAN_M = 12.0
 _GREY_PER_METRE = 20.0
 
 
-def band_grey(top: NDArray[np.float32], cell: float) -> Picture:
-    """Show band-passed height: 127 + 20 per metre above the surroundings, 127 where empty.
+def band_grey(top: Image, cell: float) -> Picture:
+    """Return band-passed height as grey: 127 + 20 per metre above the surroundings, 127 where empty.
 
     Args:
         top: (h, w) heights in metres, NaN where empty.
@@ -46,8 +46,8 @@ def band_grey(top: NDArray[np.float32], cell: float) -> Picture:
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
 
 
-def hillshade(top: NDArray[np.float32], cell: float) -> Picture:
-    """Shade heights as if lit from north-west, softened by light from the sides; 0 where empty.
+def hillshade(top: Image, cell: float) -> Picture:
+    """Return heights shaded as if lit from north-west, softened by light from the sides; 0 where empty.
 
     Args:
         top: (h, w) heights in metres, NaN where empty.
@@ -72,8 +72,8 @@ def hillshade(top: NDArray[np.float32], cell: float) -> Picture:
     return np.where(filled, np.clip(1.0 + 254.0 * light, 1, 255), 0).astype(np.uint8)
 
 
-def shaded_relief(top: NDArray[np.float32], cell: float) -> Picture:
-    """Show heights as colour under a hillshade; dark where empty. Returns (h, w, 3)."""
+def shaded_relief(top: Image, cell: float) -> Picture:
+    """Return heights as colour under a hillshade, (h, w, 3) uint8; dark where empty."""
     filled = np.isfinite(top)
     colour = height_colours(np.where(filled, top, 0.0), *height_range(top[filled]))
     shade = hillshade(top, cell).astype(np.float32)[..., None] / 255.0
@@ -81,14 +81,14 @@ def shaded_relief(top: NDArray[np.float32], cell: float) -> Picture:
     return np.where(filled[..., None], np.clip(lit, 0, 255), np.array(EMPTY_RGB)).astype(np.uint8)
 
 
-def thinned(bev: Bev, max_side: int) -> tuple[NDArray[np.float32], float, int]:
+def thinned(bev: Bev, max_side: int) -> tuple[Image, float, int]:
     """Return a BEV's heights with at most `max_side` cells a side: every n-th cell, its edge, and n."""
     step = max(1, -(-max(bev.grid.shape) // max_side))
     return bev.top[::step, ::step], bev.grid.cell * step, step
 
 
 def height_range(z: NDArray[np.floating]) -> tuple[float, float]:
-    """Return the heights in metres between which colours shall run: the middle 96 % of those given."""
+    """Return the heights in metres that colours span: the middle 96 % of those given."""
     if z.size == 0:
         return 0.0, 1.0
     step = max(1, z.size // 20_000)
@@ -97,7 +97,7 @@ def height_range(z: NDArray[np.floating]) -> tuple[float, float]:
 
 
 def height_colours(z: NDArray[np.floating], low: float, high: float) -> Picture:
-    """Colour heights in metres from dark blue (low) to yellow (high). Any shape in; (..., 3) out."""
+    """Return heights in metres as colours from dark blue (low) to yellow (high): (...) in, (..., 3) out."""
     import cv2
 
     ramp = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
@@ -106,14 +106,14 @@ def height_colours(z: NDArray[np.floating], low: float, high: float) -> Picture:
 
 
 def residual_colours(residual_m: Floats, good_m: float, bad_m: float) -> Picture:
-    """Colour residuals: green up to `good_m`, over yellow, to red from `bad_m`. (n,) in, (n, 3) out."""
+    """Return (n,) residuals as (n, 3) colours: green up to `good_m`, over yellow, to red from `bad_m`."""
     stops = np.array([GOOD_RGB, FAIR_RGB, BAD_RGB], np.float64)
     place = np.clip((residual_m - good_m) / max(bad_m - good_m, 1e-9), 0.0, 1.0) * 2.0
     mixed = [np.interp(place, [0, 1, 2], stops[:, k]) for k in range(3)]
     return np.asarray(np.rint(np.stack(mixed, axis=-1)), np.uint8)
 
 
-def residual_limits(residual_m: Floats, inlier: NDArray[np.bool_]) -> tuple[float, float]:
+def residual_limits(residual_m: Floats, inlier: Mask) -> tuple[float, float]:
     """Return where green ends and red begins, from the inliers' own spread, in whole centimetres."""
     if not inlier.any():
         return 0.1, 0.5
@@ -122,7 +122,7 @@ def residual_limits(residual_m: Floats, inlier: NDArray[np.bool_]) -> tuple[floa
 
 
 def side_by_side(left: Picture, right: Picture, gap: int = 12) -> tuple[Picture, tuple[float, float]]:
-    """Put two pictures beside each other, each in the middle of the common height.
+    """Return two pictures beside each other, each in the middle of the common height.
 
     Returns:
         the picture, and the (column, row) at which the right one's top-left pixel lies; the left one
@@ -141,11 +141,11 @@ def side_by_side(left: Picture, right: Picture, gap: int = 12) -> tuple[Picture,
 def match_lines(
     pair: Pair, gap: int = 12, max_side: int = 2048
 ) -> tuple[Picture, Floats, NDArray[np.uint8], NDArray[np.int8]]:
-    """Lay out both BEVs side by side (source left) with the lines that link them.
+    """Return both BEVs side by side (source left) with the lines that link them.
 
     Tie points are drawn once there are any (they know inliers), else the matches themselves. Of a BEV with
-    more
-    than `max_side` cells a side only every n-th is drawn.
+    more than
+    `max_side` cells a side only every n-th is drawn.
 
     Returns:
         the picture; (n, 2, 2) line ends in its pixels (column, row; pixel centres at integers);
@@ -175,12 +175,12 @@ def match_lines(
     offset_left = np.array([0.0, (picture.shape[0] - left.shape[0]) // 2])
     offset_right = np.array([column, row])
     ends = np.stack([source_px / source_step + offset_left, target_px / target_step + offset_right], axis=1)
-    colours = np.array([BAD_RGB, GOOD_RGB, WITHHELD_RGB, UNJUDGED_RGB], np.uint8)[kind]
+    colours = np.array([BAD_RGB, GOOD_RGB, HELD_OUT_RGB, UNJUDGED_RGB], np.uint8)[kind]
     return picture, ends, colours, kind
 
 
 def matches_picture(pair: Pair, max_side: int = 1400, most: int = 150) -> Picture:
-    """Draw both BEVs side by side with at most `most` matches as lines: outliers red, inliers green.
+    """Return both BEVs side by side with at most `most` matches as lines: outliers red, inliers green.
 
     Raises:
         ValueError: if the pair has no BEVs or no matches yet.
@@ -214,7 +214,7 @@ def common_rasters(pair: Pair, margin_m: float = 15.0, max_side: int = 1600) -> 
 
     Args:
         pair: with BEVs and a transform.
-        margin_m: how far around the overlap to look, metres.
+        margin_m: margin around the overlap, metres.
         max_side: cells that the grid may have along its longer side; larger ones get coarser cells.
 
     Returns:
@@ -240,8 +240,8 @@ def common_rasters(pair: Pair, margin_m: float = 15.0, max_side: int = 1600) -> 
     return warp_bev(source, T, grid), warp_bev(target, np.eye(4), grid)
 
 
-def _crop(grid: Grid, mask: NDArray[np.bool_]) -> Grid:
-    """Cut a grid down to the rows and columns in which a mask holds."""
+def _crop(grid: Grid, mask: Mask) -> Grid:
+    """Return a grid cut down to the rows and columns in which a mask holds."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     west = grid.west + float(columns[0]) * grid.cell
     north = grid.north - float(rows[0]) * grid.cell
@@ -249,14 +249,14 @@ def _crop(grid: Grid, mask: NDArray[np.bool_]) -> Grid:
 
 
 def _regrid(grid: Grid, margin_m: float, cell: float) -> Grid:
-    """Cover a grid's extent and a margin around it with cells of another size."""
+    """Return a grid that covers another's extent and a margin around it with cells of another size."""
     width = int(np.ceil((grid.width * grid.cell + 2 * margin_m) / cell))
     height = int(np.ceil((grid.height * grid.cell + 2 * margin_m) / cell))
     return Grid(float(grid.west) - margin_m, float(grid.north) + margin_m, cell, width, height)
 
 
 def edge_overlay(source: Bev, target: Bev) -> Picture:
-    """Draw height steps of both on one grid: target grey with blue steps, source's steps in orange.
+    """Return height steps of both on one grid: target grey with blue steps, source's steps in orange.
 
     Where the registration holds, orange runs along blue.
     """
@@ -270,7 +270,7 @@ def edge_overlay(source: Bev, target: Bev) -> Picture:
 
 
 def checkerboard(source: Bev, target: Bev, tile_m: float = 20.0) -> Picture:
-    """Show source (orange) and target (blue) in turn, square by square, on one grid."""
+    """Return source (orange) and target (blue) in turn, square by square, on one grid."""
     grid = target.grid
     rows, columns = np.indices(grid.shape) * grid.cell // tile_m
     of_source = ((rows + columns) % 2 == 0)[..., None]
@@ -282,7 +282,7 @@ def checkerboard(source: Bev, target: Bev, tile_m: float = 20.0) -> Picture:
     return np.asarray(np.clip(np.where(of_source, tints[0], tints[1]), 0, 255), np.uint8)
 
 
-def step_edges(top: NDArray[np.float32]) -> Floats:
+def step_edges(top: Image) -> Floats:
     """Return height steps as (h, w) 0..1: the range within 3x3 filled cells, from 1 m (0) to 4 m (1)."""
     import cv2
 
@@ -297,7 +297,7 @@ def step_edges(top: NDArray[np.float32]) -> Floats:
 
 
 def fit(picture: Picture, max_side: int) -> Picture:
-    """Shrink a picture so that its longer side is at most `max_side` pixels; never enlarge."""
+    """Return a picture shrunk so that its longer side is at most `max_side` pixels; never enlarge."""
     import cv2
 
     scale = max_side / max(picture.shape[:2])
@@ -308,12 +308,12 @@ def fit(picture: Picture, max_side: int) -> Picture:
 
 
 def png(picture: Picture) -> bytes:
-    """Encode a (h, w) or (h, w, 3) RGB picture as PNG."""
+    """Return as encoded bytes a (h, w) or (h, w, 3) RGB picture as PNG."""
     return _encode(picture, ".png", [16, 3])
 
 
 def jpeg(picture: Picture, quality: int = 90) -> bytes:
-    """Encode a (h, w) or (h, w, 3) RGB picture as JPEG."""
+    """Return as encoded bytes a (h, w) or (h, w, 3) RGB picture as JPEG."""
     return _encode(picture, ".jpg", [1, quality])
 
 
@@ -330,10 +330,8 @@ def _rgb(picture: Picture) -> Picture:
     return np.repeat(picture[..., None], 3, axis=2) if picture.ndim == 2 else picture
 
 
-def _masked_blur(
-    top: NDArray[np.float32], filled: NDArray[np.bool_], sigma: float, fill: bool = False
-) -> NDArray[np.float32]:
-    """Gaussian over filled cells only; with `fill` empty cells take their neighbourhood's mean."""
+def _masked_blur(top: Image, filled: Mask, sigma: float, fill: bool = False) -> Image:
+    """Return a Gaussian mean of filled cells; with `fill` empty cells take their neighbourhood's mean."""
     import cv2
 
     middle = np.float32(np.median(top[filled])) if filled.any() else np.float32(0.0)
@@ -348,8 +346,8 @@ def _masked_blur(
     return np.asarray(smooth, np.float32)
 
 
-def _masked_mean(top: NDArray[np.float32], filled: NDArray[np.bool_], size: int) -> NDArray[np.float32]:
-    """Mean of the filled cells in a square of `size` cells; the overall median where there are none."""
+def _masked_mean(top: Image, filled: Mask, size: int) -> Image:
+    """Return the mean of filled cells in a square of `size` cells; the overall median where it has none."""
     import cv2
 
     middle = np.float32(np.median(top[filled])) if filled.any() else np.float32(0.0)

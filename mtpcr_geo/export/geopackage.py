@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import OutputError
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-Floats = NDArray[np.float64]
 Kind = Literal["POINT", "LINESTRING", "POLYGON"]
 
 _APPLICATION_ID = 0x47504B47  # "GPKG"
@@ -60,12 +60,12 @@ _WGS84 = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Layer:
     """One vector layer.
 
     Attributes:
-        name: of the layer; a plain identifier.
+        name: of the layer; letters, digits and underscores.
         kind: what its geometries are.
         geometries: one (m, 2) or (m, 3) float64 array each, absolute CRS coordinates: m = 1 for a
             point; a polygon is its closed outer ring.
@@ -99,7 +99,7 @@ def write_geopackage(path: str | Path, layers: Iterable[Layer], crs: CRS | None)
     try:
         path.unlink(missing_ok=True)
         with closing(sqlite3.connect(path)) as base, base:
-            # the file has a passing name until it is whole, so no journal needs to guard it
+            # the file has a temporary name until it is whole, so no journal needs to guard it
             base.execute("PRAGMA journal_mode = OFF")
             base.execute("PRAGMA synchronous = OFF")
             base.execute(f"PRAGMA application_id = {_APPLICATION_ID}")
@@ -114,7 +114,7 @@ def write_geopackage(path: str | Path, layers: Iterable[Layer], crs: CRS | None)
 
 
 def blob(kind: Kind, xyz: Floats, srs: int) -> bytes:
-    """Encode one geometry as GeoPackage binary: header with envelope, then little-endian WKB.
+    """Return one geometry as GeoPackage binary: header with envelope, then little-endian WKB.
 
     Args:
         kind: what it is.
@@ -154,7 +154,7 @@ def _add_srs(base: sqlite3.Connection, crs: CRS | None) -> int:
 
 
 def _definition(crs: CRS) -> str:
-    """WKT as the standard asks for it; the newer form where the older cannot say it."""
+    """Return WKT as the standard asks for it; the newer form where the older cannot express it."""
     from pyproj.enums import WktVersion
     from pyproj.exceptions import CRSError
 
@@ -221,6 +221,6 @@ def _sql_type(values: NDArray[Any]) -> str:
 
 
 def _plain(values: NDArray[Any]) -> list[Any]:
-    """Python values as SQLite takes them; SQLite itself stores NaN as NULL."""
+    """Return values as SQLite takes them; SQLite itself stores NaN as NULL."""
     values = np.asarray(values)
     return list((values.astype(np.int64) if values.dtype.kind == "b" else values).tolist())

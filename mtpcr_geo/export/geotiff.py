@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from mtpcr_geo import __version__
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats, Image, Mask
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Pair, Side
 from mtpcr_geo.crs import WorkFrame
-
-Floats = NDArray[np.float64]
+from mtpcr_geo.export import overviews
 
 BANDS = (
     ("highest z in the cell, metres", "metre"),
@@ -41,14 +41,15 @@ def write_bev(
     """Write a BEV as a tiled, compressed float32 GeoTIFF with overviews.
 
     Bands: highest z, lowest z (both absolute: the origin's z is added; NaN is nodata) and the number of
-    points (0 where empty). Cell edges, not centres, carry the geotransform (AREA_OR_POINT=Area).
+    points (0 where empty). Cell edges, not centres, carry the geotransform (AREA_OR_POINT=Area). A cell of
+    an overview has the highest, the lowest and the number of points of all the cells that it covers.
 
     Args:
         path: where to write; no other file is left beside it.
         bev: the raster, in levelled work coordinates, metres.
         frame: CRS and origin of the work coordinates that the BEV's side has.
         T_level_work: 4x4 from work to levelled coordinates. Where it is not the identity the raster's
-            positions are not CRS coordinates, so the file gets no CRS and says in its tags how the
+            positions are not CRS coordinates, so the file gets no CRS; its tags state how the
             levelled frame lies.
         tags: further tags for the file.
 
@@ -57,8 +58,8 @@ def write_bev(
 
     """
     import rasterio
-    from rasterio.enums import Resampling
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
+    from rasterio.io import MemoryFile
 
     level = np.eye(4) if T_level_work is None else np.asarray(T_level_work, np.float64)
     upright = bool(np.array_equal(level, np.eye(4)))
@@ -72,6 +73,8 @@ def write_bev(
         "nodata": float("nan"),
         "transform": geotransform(grid, frame.origin),
         "crs": frame.crs.to_wkt() if frame.crs is not None and upright else None,
+    }
+    creation: dict[str, Any] = {
         "tiled": True,
         "blockxsize": _TILE,
         "blockysize": _TILE,
@@ -94,20 +97,27 @@ def write_bev(
         with rasterio.Env(GDAL_PAM_ENABLED="NO"), warnings.catch_warnings():
             # a local raster with its corner at zero is georeferenced all the same
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path, "w", **profile) as out:
-                out.update_tags(**every_tag)
-                for index, (text, unit) in enumerate(BANDS, start=1):
-                    out.set_band_description(index, text)
-                    out.set_band_unit(index, unit)
-                out.write(_absolute(bev.top, frame), 1)
-                out.write(_absolute(bev.low, frame), 2)
-                out.write(bev.count.astype(np.float32), 3)
-            factors = overview_factors(grid)
-            if factors:
-                with rasterio.open(path, "r+") as out:
-                    out.build_overviews(factors, Resampling.average)
+            bands = [_absolute(bev.top, frame), _absolute(bev.low, frame), bev.count.astype(np.float32)]
+            levels = overview_levels(grid)
+            if not levels:
+                with rasterio.open(path, "w", **profile, **creation) as out:
+                    _fill(out, bands, every_tag)
+            else:
+                with MemoryFile(ext=".tif") as memory:
+                    with memory.open(**profile, **creation | {"zlevel": 1}) as out:
+                        _fill(out, bands, every_tag)
+                    pools = [overviews.HIGHEST, overviews.LOWEST, overviews.SUM]
+                    overviews.copy_with_overviews(memory.name, Path(path), bands, pools, levels, **creation)
     except (RasterioError, OSError) as error:
         raise OutputError(f"cannot write the raster {Path(path)}: {error}") from error
+
+
+def _fill(out: Any, bands: Sequence[Image], tags: Mapping[str, str]) -> None:
+    out.update_tags(**tags)
+    for index, (band, (text, unit)) in enumerate(zip(bands, BANDS, strict=True), start=1):
+        out.set_band_description(index, text)
+        out.set_band_unit(index, unit)
+        out.write(band, index)
 
 
 def write_side_bev(path: str | os.PathLike[str], side: Side, frame: WorkFrame | None = None) -> None:
@@ -210,7 +220,7 @@ def warp_bev(bev: Bev, T_to_bev: Floats, grid: Grid) -> Bev:
         row = np.repeat(rows, grid.width)
         column = np.tile(np.arange(grid.width), len(rows))
         plan = grid.to_metres(np.column_stack([column, row]).astype(np.float64))
-        found, xyz_bev, index = _look_back(bev, filled, T_to_bev, plan, height)
+        found, xyz_bev, index = _source_cells(bev, filled, T_to_bev, plan, height)
         row, column, xyz_bev, index = row[found], column[found], xyz_bev[found], index[found]
         top[row, column] = _move_z(T_to_bev, xyz_bev, bev.top.ravel()[index])
         low[row, column] = _move_z(T_to_bev, xyz_bev, bev.low.ravel()[index])
@@ -218,10 +228,10 @@ def warp_bev(bev: Bev, T_to_bev: Floats, grid: Grid) -> Bev:
     return Bev(grid, top, low, count)
 
 
-def _look_back(
-    bev: Bev, filled: NDArray[np.bool_], T_to_bev: Floats, plan: Floats, height: float
-) -> tuple[NDArray[np.bool_], Floats, NDArray[np.int64]]:
-    """Find the BEV's cell for each of (n, 2) places: found or not, (n, 3) place in the BEV, flat index."""
+def _source_cells(
+    bev: Bev, filled: Mask, T_to_bev: Floats, plan: Floats, height: float
+) -> tuple[Mask, Floats, NDArray[np.int64]]:
+    """Return the BEV's cell for each of (n, 2) places: found or not, (n, 3) place in the BEV, flat index."""
     T_bev_to = transforms.inverse(T_to_bev)
     z_to = np.full(len(plan), (T_to_bev @ np.array([0.0, 0.0, height, 1.0]))[2])
     tilted = abs(T_to_bev[2, 2]) < 1.0 - 1e-7
@@ -245,22 +255,20 @@ def geotransform(grid: Grid, origin: Floats) -> Any:
     )
 
 
-def overview_factors(grid: Grid) -> list[int]:
-    """Return the powers of two at which a raster of this size deserves overviews."""
-    factors = []
-    factor = 2
-    while max(grid.width, grid.height) / factor >= _SMALLEST_OVERVIEW:
-        factors.append(factor)
-        factor *= 2
-    return factors
+def overview_levels(grid: Grid) -> int:
+    """Return how often a raster of this size is worth halving: until its longer side is below 256 cells."""
+    levels = 0
+    while max(grid.width, grid.height) / 2 ** (levels + 1) >= _SMALLEST_OVERVIEW:
+        levels += 1
+    return levels
 
 
-def _move_z(T: Floats, xyz: Floats, z: NDArray[np.float32]) -> Floats:
-    """Heights after T of points with the plan position of `xyz` and height `z`."""
+def _move_z(T: Floats, xyz: Floats, z: Image) -> Floats:
+    """Return heights after T of points with the plan position of `xyz` and height `z`."""
     return np.asarray(T[2, 0] * xyz[:, 0] + T[2, 1] * xyz[:, 1] + T[2, 2] * z + T[2, 3])
 
 
-def _absolute(z: NDArray[np.float32], frame: WorkFrame) -> NDArray[np.float32]:
+def _absolute(z: Image, frame: WorkFrame) -> Image:
     return (z.astype(np.float64) + float(frame.origin[2])).astype(np.float32)
 
 

@@ -1,4 +1,181 @@
-"""`run.json`: what a run came to, for programs to read."""
+"""`run.json`: the result of a run and how it came about, for programs to read.
+
+Units are those in which a key ends; what is not known is null. ``<...>`` stands
+for a name: a stage's tag, a role (source, target, result, work), a library.
+
+- ``verdict``: accepted, doubtful or refused; null where the run ended before a verdict
+- ``reasons``: why: one sentence each
+- ``metrics``: what the verdict rests on, see below; empty where the run failed before
+- ``T_target_source``: 4x4 on coordinates as they stand in the files, source to target; null if not found
+- ``frames``: CRS and units of source, target and result, and the work frame; null without a pair
+- ``time_s.<tag>``: seconds of each stage
+- ``time_s.total``: seconds from the start to the writing of this file
+- ``peak_memory_mb``: largest memory of the process so far, MiB; null where the system does not report it
+- ``options.<tag>``: options of each stage, defaults included
+- ``stages[].type``: type of the stage, in the order in which they ran
+- ``stages[].tag``: its name in the pipeline
+- ``stages[].options``: its options, as above
+- ``stages[].seconds``: its time
+- ``stages[].metadata``: its own figures, see below
+- ``stages[].skipped``: why it did not run, where it did not
+- ``stages[].failed``: why the registration ended there, where it did
+- ``pipeline``: the pipeline JSON that was run
+- ``versions.<library>``: version of this package, of Python and of the libraries installed
+- ``inputs[].path``: each file read
+- ``inputs[].bytes``: its size
+- ``inputs[].sha256``: its hash
+- ``outputs``: files written before this one
+
+The frames; ``result`` is that of the registered cloud:
+
+- ``frames.<role>.crs``: null for local coordinates, else as follows
+- ``frames.<role>.crs.name``: its name
+- ``frames.<role>.crs.authority``: its code, such as EPSG:25832; null without one
+- ``frames.<role>.units``: units of x, y and z
+- ``frames.<role>.operation``: how its coordinates come to the work frame, by the name of the operation
+- ``frames.<role>.accuracy_m``: accuracy of the operation; null where nobody stated one
+- ``frames.<role>.grids``: grid files that it uses
+- ``frames.<role>.heights``: what heights refer to
+- ``frames.<role>.vertical``: what was to be done with different vertical datums
+- ``frames.<role>.notes``: what had to be assumed
+- ``frames.<role>.grid_scale``: least and greatest length on the map of a metre on the ground
+- ``frames.work.source_origin``: subtracted from the source's metric coordinates, metres
+- ``frames.work.target_origin``: the same for the target
+
+The metrics:
+
+- ``metrics.held_out_tie_points``: tie points each judged by a transform solved without it
+- ``metrics.held_out_agreeing``: of these, tie points within the tolerance in plan
+- ``metrics.held_out_agreeing_share``: the same as a share, 0 to 1
+- ``metrics.held_out_tolerance_m``: the tolerance
+- ``metrics.held_out_median_m``: median plan residual of the held-out tie points
+- ``metrics.neg_log10_p``: significance: -log10 of the probability that chance makes as many agree; at most
+  300
+- ``metrics.hypothesis_margin``: how many times stronger the pose is than the next distinct one; null if
+  unknown
+- ``metrics.patch_support``: share of the patches in the overlap that agree on the pose; null from keypoints
+- ``metrics.overlap_m2``: ground that both clouds see
+- ``metrics.overlap_source``: the same as a share of the source's ground, 0 to 1
+- ``metrics.overlap_target``: the same as a share of the target's ground, 0 to 1
+- ``metrics.ground_cells``: cells in which both see the ground
+- ``metrics.ground_agreeing``: of these, cells whose heights agree within 0.5 m
+- ``metrics.refined_away_m``: how far the refinement moved the middle of the source
+- ``metrics.vertical_offset_m``: metres added to the source's heights, with vertical: estimate
+- ``metrics.yaw_deg``: yaw of the transform in the work frame, counter-clockwise from above
+- ``metrics.tilt_deg``: angle by which it tilts the vertical
+- ``metrics.shift_work_m``: its translation between work coordinates
+- ``metrics.tie_points``: all tie points
+- ``metrics.tie_points_agreeing``: of these, tie points that agree with the final transform
+- ``metrics.sigma_yaw_deg``: standard deviation of the yaw, from the tie points
+- ``metrics.sigma_plan_m``: standard deviation of the shift in plan, from the tie points
+- ``metrics.sigma_plan_source_centroid_m``: the same at the middle of the source
+
+A stage's own figures (``stages[].metadata``), by its type; stages that PDAL serves have what PDAL reports:
+
+- ``readers.las filename``: the file
+- ``readers.las count``: points by its header
+- ``readers.las minimum``: least coordinates by its header
+- ``readers.las maximum``: greatest coordinates by its header
+- ``readers.las srs``: its CRS as WKT, or empty
+- ``readers.memory name``: what a cloud given from Python is called
+- ``readers.memory count``: its points
+- ``readers.memory srs``: its CRS as WKT, or empty
+- ``mtpcr.level <role>.points``: points read
+- ``mtpcr.level <role>.noise_points``: of these, classified as noise (7, 18) or flagged withheld, and left
+  out
+- ``mtpcr.level <role>.sampled``: points kept to work on
+- ``mtpcr.level <role>.method``: none, plane or verticals: what the cloud was levelled by
+- ``mtpcr.level <role>.tilt_deg``: angle between its z axis and the vertical found
+- ``mtpcr.level <role>.why``: why it was kept as it is, where it was
+- ``mtpcr.level <role>.plane_tilt_deg``: tilt of the ground plane
+- ``mtpcr.level <role>.plane_inlier_share``: share of the points on that plane, 0 to 1
+- ``mtpcr.level <role>.verticals``: points on walls, poles and trunks that agree on the vertical
+- ``mtpcr.level <role>.verticals_spread_deg``: their robust spread about it
+- ``mtpcr.level <role>.plane_to_verticals_deg``: angle between the plane's normal and the vertical
+- ``mtpcr.bev cell_m``: edge of a cell
+- ``mtpcr.bev cell_chosen``: whether it was chosen from the densities
+- ``mtpcr.bev gamma_m``: gamma of Eq. 1, where that chose the cells
+- ``mtpcr.bev <role>.cell_m``: edge of a cell of this raster
+- ``mtpcr.bev <role>.width``: columns
+- ``mtpcr.bev <role>.height``: rows
+- ``mtpcr.bev <role>.filled_share``: share of the cells with points, 0 to 1
+- ``mtpcr.bev <role>.points_per_m2``: points per occupied square metre
+- ``mtpcr.bev <role>.area_m2``: occupied ground
+- ``mtpcr.enhance <role>.mean_grey``: mean of the image that is matched, 0 to 255
+- ``mtpcr.enhance <role>.saturated_share``: share of its pixels that are 0 or 255
+- ``mtpcr.match matches``: matches found
+- ``mtpcr.match method``: name of a keypoint matcher
+- ``mtpcr.match cell_m``: cell of the last search; from keypoints, those of both rasters
+- ``mtpcr.match search_radius_m``: how far around the pose each patch was searched
+- ``mtpcr.match searched[].cell_m``: cell of each level of the search
+- ``mtpcr.match searched[].scores``: scores of its hypotheses, best first
+- ``mtpcr.match margin``: strength of the best hypothesis over that of the next distinct one
+- ``mtpcr.match support``: share of the patches that agree on the best pose, 0 to 1
+- ``mtpcr.match support_next``: the same of the next distinct pose
+- ``mtpcr.match neg_log10_p``: significance of that support
+- ``mtpcr.match patches``: patches in the overlap
+- ``mtpcr.match scores``: scores of the hypotheses at the finest cells
+- ``mtpcr.match strengths``: their strengths: score less what chance gives
+- ``mtpcr.match zoom``: factor by which images were reduced before keypoints were sought
+- ``mtpcr.match turns_deg``: turns of the source that were tried
+- ``mtpcr.match turn_matches``: matches at each of them
+- ``mtpcr.match turn_agreeing``: of these, matches that agree on one pose
+- ``mtpcr.match turn_deg``: the turn that was taken
+- ``mtpcr.match agreeing``: matches that agree at that turn
+- ``mtpcr.match tolerance_m``: how far agreeing matches may lie from the pose
+- ``mtpcr.match keypoints``: keypoints in source and target
+- ``mtpcr.focus overlap``: share of the source's ground that the target covers, after the first pass
+- ``mtpcr.focus theta``: share from which there is no second pass
+- ``mtpcr.focus agreeing_before``: matches that agreed on a pose in the first pass
+- ``mtpcr.focus matches_before``: matches of the first pass
+- ``mtpcr.focus pose_known``: whether enough of them agreed
+- ``mtpcr.focus applied``: whether the second pass was taken
+- ``mtpcr.focus why``: why not, where it was not
+- ``mtpcr.focus cells_m``: cells of the second pass, source and target
+- ``mtpcr.focus agreeing_after``: matches that agreed in the second pass
+- ``mtpcr.focus matches_after``: matches of the second pass
+- ``mtpcr.inverse_mapping tie_points``: matches that became tie points
+- ``mtpcr.inverse_mapping held_out``: of these, kept from the solve
+- ``mtpcr.solve used``: tie points solved from
+- ``mtpcr.solve inliers``: of these, within the final threshold
+- ``mtpcr.solve iterations``: rounds until nothing changed
+- ``mtpcr.solve threshold_m``: the final threshold
+- ``mtpcr.solve yaw_deg``: yaw found, between levelled clouds
+- ``mtpcr.solve settings.<name>``: robust_start, upright, tries and seed, as in the options
+- ``mtpcr.refine <fit>.ground_cells``: cells where both see the ground; fit is ground_before or ground_after
+  ICP
+- ``mtpcr.refine <fit>.ground_cells_agreeing``: of these, cells that agree with the fit
+- ``mtpcr.refine <fit>.rise_m``: by how much the source was raised
+- ``mtpcr.refine <fit>.ground_spread_m``: robust spread of the height differences
+- ``mtpcr.refine <fit>.tilt_deg``: by how much it was tilted
+- ``mtpcr.refine <fit>.followed``: whether the fit was taken over
+- ``mtpcr.refine icp.method``: variant of ICP
+- ``mtpcr.refine icp.voxel_m``: thinning of the points
+- ``mtpcr.refine icp.points_source``: points kept of the source
+- ``mtpcr.refine icp.points_target``: points kept of the target
+- ``mtpcr.refine icp.tried.<candidate>.surface_residual``: how badly flat surfaces meet: 0 all meet, 1 none
+  does
+- ``mtpcr.refine icp.tried.<candidate>.tie_points``: tie points that agree with it
+- ``mtpcr.refine icp.chosen``: the candidate that was taken
+- ``mtpcr.refine icp.followed``: whether that is a run of ICP
+- ``mtpcr.refine icp.lost_tie_points``: whether a run was not followed because tie points were lost
+- ``mtpcr.refine icp.rounds[].max_correspondence_distance_m``: farthest correspondence of each round
+- ``mtpcr.refine icp.rounds[].iterations``: its iterations
+- ``mtpcr.refine icp.rounds[].inliers``: points with a correspondence at its end
+- ``mtpcr.refine icp.rounds[].converged``: whether it stood still
+- ``mtpcr.refine icp.rotated_deg``: angle by which ICP turned the start
+- ``mtpcr.assess verdict``: as above
+- ``mtpcr.assess reasons``: as above
+- ``mtpcr.assess <metric>``: the metrics, as above
+- ``mtpcr.assess tie_points_and_ground_agreeing``: with a prior: tie points and cells of ground that agree
+  with the result
+- ``mtpcr.assess with_prior``: the same for the prior
+- ``mtpcr.assess prior_kept``: whether the prior was kept
+- ``mtpcr.apply skipped``: why no cloud was made, where none was
+- ``mtpcr.write_<what> skipped``: why nothing was written, where nothing was
+- ``writers.las filename``: the file
+- ``writers.las count``: points written
+"""
 
 from __future__ import annotations
 
@@ -16,14 +193,14 @@ def write_run_json(path: Path, facts: Mapping[str, Any]) -> None:
 
     Args:
         path: file to write.
-        facts: verdict, reasons, metrics, times, options, versions, inputs with hashes, outputs.
+        facts: what the module docstring lists.
 
     """
     path.write_text(json.dumps(plain(facts), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def plain(value: Any) -> Any:
-    """Reduce a value to what JSON knows: arrays become lists, and what is not finite becomes null."""
+    """Return a value as JSON has it: arrays become lists, and what is not finite becomes null."""
     if isinstance(value, Mapping):
         return {str(key): plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple | set):

@@ -1,7 +1,7 @@
-"""How what a run leaves shall look in QGIS: small QML styles, carried inside the GeoPackage.
+"""QML styles for QGIS, carried inside the GeoPackage.
 
 QGIS reads a table `layer_styles` in a GeoPackage and applies the style marked as default when the
-layer is opened, so nobody has to colour the residuals by hand.
+layer is opened, so residuals need not be coloured by hand.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def footprint_style() -> str:
 
 
 def _ruled(kind: str, rules: tuple[tuple[str, str, str], ...]) -> str:
-    """Assemble a rule-based QML document; kind is "marker", "line" or "fill"."""
+    """Return a rule-based QML document; kind is "marker", "line" or "fill"."""
     entries = "".join(
         f'<rule key="r{i}" symbol="{i}" filter={quoteattr(test)} label={quoteattr(label)}/>'
         for i, (test, label, _) in enumerate(rules)

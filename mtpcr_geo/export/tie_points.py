@@ -9,23 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.export import styles
 from mtpcr_geo.export.geopackage import Layer, write_geopackage
 
-Floats = NDArray[np.float64]
 Fields = dict[str, NDArray[Any]]
 
 _FOOTPRINT_POINTS = 40_000
 
 
 def write_tie_points(path: str | Path, pair: Pair) -> None:
-    """Write what links the clouds, as far as the run came, for looking at in a GIS.
+    """Write what links the clouds, as far as the run came, for viewing in a GIS.
 
     Layers, all in the CRS of the work frame (the target's; none for local clouds), coordinates absolute:
 
     - ``tie_points``: 3D points at the target's end, with ``residual_m`` (and its parts ``dx_m``, ``dy_m``,
-      ``dz_m``: registered source minus target), ``score``, ``inlier``, ``held out`` and the source's
+      ``dz_m``: registered source minus target), ``score``, ``inlier``, ``held_out`` and the source's
       coordinates as they stand in its file;
     - ``links``: 3D lines from the registered source's end to the target's end of each tie point;
     - ``footprints``: convex outlines of the target and of the registered source;
@@ -41,7 +41,7 @@ def write_tie_points(path: str | Path, pair: Pair) -> None:
     """
     layers = [_footprints(pair)]
     if pair.tie_points is not None and len(pair.tie_points.target):
-        layers.append(_ties(pair))
+        layers.append(_tie_points(pair))
         if pair.T_target_source is not None:
             layers.append(_links(pair))
     if pair.matches is not None and pair.matches.hypotheses:
@@ -79,7 +79,7 @@ def outline(plan: Floats) -> NDArray[np.int64]:
 def footprints(pair: Pair) -> dict[str, Floats]:
     """Return the convex outlines, as closed (m, 2) rings in work coordinates of the target, metres.
 
-    Some ten thousand points of each sample are looked at: enough for a footprint.
+    Some ten thousand points of each sample are used: enough for a footprint.
 
     Returns:
         the rings by role: the target's, and the registered source's once there is a transform; a cloud
@@ -99,7 +99,7 @@ def footprints(pair: Pair) -> dict[str, Floats]:
     return rings
 
 
-def _ties(pair: Pair) -> Layer:
+def _tie_points(pair: Pair) -> Layer:
     tie_points = pair.tie_points
     assert tie_points is not None
     target, registered = tie_positions(pair)
@@ -177,7 +177,7 @@ def _hypotheses(pair: Pair) -> Layer:
 
 
 def _limits(pair: Pair) -> tuple[float, float]:
-    """Where green ends and red begins, from the inliers' own spread, rounded to centimetres."""
+    """Return where green ends and red begins, from the inliers' own spread, rounded to centimetres."""
     target, registered = tie_positions(pair)
     assert pair.tie_points is not None
     if registered is None or not pair.tie_points.inlier.any():

@@ -1,18 +1,18 @@
-"""Transforms as files that say which frame they are in, at full precision."""
+"""Transforms as files that state their frames, at full precision."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import InputError
-from mtpcr_geo.core.frames import FrameLink
+from mtpcr_geo.core.frames import FrameLink, OperationReport, Vertical
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.crs.facts import facts_of
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from mtpcr_geo.core.types import Pair
 
-Floats = NDArray[np.float64]
 KIND, VERSION = "mtpcr-geo transform", 1
 _SHARED_SHIFT = 10_000.0  # beyond this, single precision would show in one common shift
 _EARTH_RADIUS = 6_371_000.0
@@ -48,7 +47,7 @@ def write_transform_json(path: str | Path, pair: Pair) -> None:
         "exactness": {
             "exact": chain.is_affine,
             "departure_m": chain.departure,
-            "note": "T_target_source says the same as the chain"
+            "note": "T_target_source is exactly the chain"
             if chain.is_affine
             else "T_target_source is the best fit within the source's bounds; the chain is exact",
         },
@@ -57,7 +56,7 @@ def write_transform_json(path: str | Path, pair: Pair) -> None:
             "source": chain.pivot,
             "target": chain.forward(chain.pivot[None])[0],
             "linear": T[:3, :3],
-            "note": "target = linear (x - source pivot) + target pivot loses no digits far from the origin",
+            "note": "target = linear (x - source pivot) + target pivot is precise far from the origin too",
         },
         "motion": _motion(chain),
         "work": {
@@ -172,11 +171,11 @@ def read_transform(path: str | Path) -> TransformChain:
 
 
 def frames_of(pair: Pair) -> dict[str, Any]:
-    """Say in which CRSs and units source, target and result stand, and how each comes to the work frame."""
+    """Return the CRSs and units of source, target and result, and how each comes to the work frame."""
     links = {"source": pair.source.link, "target": pair.target.link}
     links["result"] = pair.frame.output or pair.target.link
     frames: dict[str, Any] = {
-        role: {"crs": _crs(link.file_crs, wkt=False), "units": units_of(link), **link.report}
+        role: {"crs": _crs(link.file_crs, wkt=False), "units": units_of(link), **link.report.as_dict()}
         for role, link in links.items()
     }
     frames["work"] = {
@@ -189,7 +188,7 @@ def frames_of(pair: Pair) -> dict[str, Any]:
 
 
 def dumps(value: Any, indent: int = 0) -> str:
-    """Write JSON with 17 significant digits, and the rows of a matrix in a line each."""
+    """Return JSON with 17 significant digits, and the rows of a matrix in a line each."""
     pad = "  " * (indent + 1)
     if isinstance(value, np.ndarray):
         value = value.tolist()
@@ -236,16 +235,14 @@ def _motion(chain: TransformChain) -> dict[str, Any]:
     shift = chain.shift_m
     if shift is not None:
         motion["shift_of_pivot_m"] = shift
-        motion["vertical"] = chain.source.report.get("vertical", "")
+        motion["vertical"] = chain.source.report.vertical
         if chain.vertical_offset_m is not None:
             motion["vertical_offset_m"] = chain.vertical_offset_m
     return motion
 
 
 def units_of(link: FrameLink) -> list[str]:
-    """Name the units of x, y and z in a file."""
-    if link.file_crs is None:
-        return ["metre"] * 3
+    """Return the units of x, y and z in a file."""
     facts = facts_of(link.file_crs)
     return [facts.unit_name, facts.unit_name, facts.height_unit_name]
 
@@ -254,8 +251,8 @@ def _crs(crs: CRS | None, wkt: bool = True) -> dict[str, Any] | None:
     if crs is None:
         return None
     authority = crs.to_authority()
-    said = {"name": crs.name, "authority": ":".join(authority) if authority else None}
-    return said | {"wkt": crs.to_wkt("WKT2_2019")} if wkt else said
+    named = {"name": crs.name, "authority": ":".join(authority) if authority else None}
+    return named | {"wkt": crs.to_wkt("WKT2_2019")} if wkt else named
 
 
 def _link(link: FrameLink) -> dict[str, Any]:
@@ -266,7 +263,7 @@ def _link(link: FrameLink) -> dict[str, Any]:
         "factor": link.factor,
         "origin": link.origin,
         "bounds": link.bounds,
-        "report": link.report,
+        "report": link.report.as_dict(),
     }
 
 
@@ -289,7 +286,24 @@ def _read_link(data: Mapping[str, Any]) -> FrameLink:
         factor=_array(data["factor"], (3,)),
         pipeline=pipeline,
         bounds=None if data["bounds"] is None else _array(data["bounds"], (2, 3)),
-        report=dict(data["report"]),
+        report=_read_report(data["report"]),
+        georeferenced=facts_of(crs).georeferenced,
+    )
+
+
+def _read_report(data: Mapping[str, Any]) -> OperationReport:
+    vertical: Vertical | None = next((one for one in get_args(Vertical) if one == data["vertical"]), None)
+    if vertical is None:
+        raise ValueError(f"vertical is {data['vertical']!r}")
+    scale = data.get("grid_scale")
+    return OperationReport(
+        operation=str(data["operation"]),
+        accuracy_m=None if data["accuracy_m"] is None else float(data["accuracy_m"]),
+        grids=tuple(str(grid) for grid in data["grids"]),
+        heights=str(data["heights"]),
+        vertical=vertical,
+        unit_notes=tuple(str(note) for note in data["notes"]),
+        grid_scale=None if scale is None else (float(scale[0]), float(scale[1])),
     )
 
 

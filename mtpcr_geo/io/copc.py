@@ -19,6 +19,7 @@ import numpy as np
 from laspy.vlrs.vlrlist import VLRList
 from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.io.octree import Key, OctreeSorter, Spool, quantise
 
@@ -77,7 +78,7 @@ def _write(
     output: BinaryIO,
     header: laspy.LasHeader,
     nodes: Iterator[tuple[Key, NDArray[Any]]],
-    low: NDArray[np.float64],
+    low: Floats,
     side: float,
 ) -> None:
     laz = lazrs.LazVlr.new_for_compression(

@@ -1,4 +1,4 @@
-"""The dimensions of a point beyond X, Y, Z: laspy's names, PDAL's names, and what marks noise."""
+"""The dimensions of a point beyond X, Y, Z: laspy's names and PDAL's names."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo.core.cloud import PointTable
+from mtpcr_geo.core.arrays import Floats, Mask
+from mtpcr_geo.core.cloud import CLASS_FLAGS, PointTable, noise_of
 
-LOW_NOISE, HIGH_NOISE, LEGACY_OVERLAP = 7, 18, 12
+LEGACY_OVERLAP = 12
 SCAN_ANGLE_STEP = 0.006  # degrees a unit, point formats 6 and up
 
 # PDAL's name of each dimension that laspy knows; the scan angle is apart, since its unit changes.
@@ -36,8 +37,8 @@ PDAL_NAMES = {
 _PLACE = {"X", "Y", "Z"}
 
 
-def las_table(record: Any, xyz: NDArray[np.float64]) -> PointTable:
-    """Lay out a laspy point record as columns by PDAL name, X, Y, Z (float64) first."""
+def las_table(record: Any, xyz: Floats) -> PointTable:
+    """Return a laspy point record as columns by PDAL name, X, Y, Z (float64) first."""
     table: dict[str, NDArray[np.generic]] = {axis: xyz[:, i] for i, axis in enumerate("XYZ")}
     for dimension in record.point_format.dimensions:
         name = dimension.name
@@ -53,54 +54,29 @@ def las_table(record: Any, xyz: NDArray[np.float64]) -> PointTable:
     return table
 
 
-def noise_of_record(record: Any) -> NDArray[np.bool_]:
+def noise_of_record(record: Any) -> Mask:
     """Return which points of a laspy record are classified as noise or flagged withheld, (n,)."""
-    return _noise(np.asarray(record["classification"]), np.asarray(record["withheld"]))
+    return noise_of(np.asarray(record["classification"]), np.asarray(record["withheld"]))
 
 
-def noise_of_table(table: PointTable) -> NDArray[np.bool_]:
-    """Return which points of a table are classified as noise or flagged withheld, (n,)."""
-    classification, flags = split_classification(table)
-    if classification is None:
-        return np.zeros(len(table["X"]), bool)
-    return _noise(classification, flags["Withheld"])
+def separate_legacy_flags(table: PointTable) -> PointTable:
+    """Take the flags out of the upper three bits of ``Classification``, where old programs keep them.
 
+    PDAL before 2.6 gives the classification byte of LAS point formats 0-5 as it stands in the file: five
+    bits of class, then synthetic, key point and withheld. That depends on the
+    file read; it cannot be known from the values.
 
-def _noise(classification: NDArray[Any], withheld: NDArray[Any]) -> NDArray[np.bool_]:
-    noise = (classification == LOW_NOISE) | (classification == HIGH_NOISE) | (withheld != 0)
-    return np.asarray(noise, bool)
-
-
-def split_classification(
-    table: PointTable,
-) -> tuple[NDArray[np.uint8] | None, dict[str, NDArray[np.uint8]]]:
-    """Return class and flags of a table, however its version of PDAL holds them.
-
-    PDAL from 2.6 on has one dimension a flag. Before that the flags stand in ``ClassFlags`` for point
-    formats 6 and up, and in the upper three bits of ``Classification`` for the others.
+    Args:
+        table: dimensions by PDAL name.
 
     Returns:
-        The classes (n,), or None if there are none; and Synthetic, KeyPoint, Withheld and Overlap,
-        each (n,) of 0 or 1.
+        The same table with ``Classification`` 0-31 and the flags as dimensions of their own; the table
+        itself where it has no classification, or has flags already.
 
     """
-    names = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
-    none = np.zeros(len(table["X"]), np.uint8)
-    raw = table.get("Classification")
-    classification = None if raw is None else np.asarray(raw).astype(np.uint8)
-    if any(name in table for name in names):
-        flags = {name: np.asarray(table.get(name, none)).astype(np.uint8) for name in names}
-    elif "ClassFlags" in table:
-        bits = np.asarray(table["ClassFlags"]).astype(np.uint8)
-        flags = {name: _bit(bits, place) for place, name in enumerate(names)}
-    elif classification is not None:
-        flags = {name: _bit(classification, 5 + place) for place, name in enumerate(names[:3])}
-        flags["Overlap"] = none
-        classification = (classification & 31).astype(np.uint8)
-    else:
-        flags = dict.fromkeys(names, none)
-    return classification, flags
-
-
-def _bit(values: NDArray[np.uint8], place: int) -> NDArray[np.uint8]:
-    return ((values >> place) & 1).astype(np.uint8)
+    has_flags = any(name in table for name in (*CLASS_FLAGS, "ClassFlags"))
+    if "Classification" not in table or has_flags:
+        return table
+    raw = np.asarray(table["Classification"]).astype(np.uint8)
+    flags = {name: (raw >> (5 + place)) & 1 for place, name in enumerate(CLASS_FLAGS[:3])}
+    return {**table, "Classification": raw & 31, **flags}

@@ -15,7 +15,7 @@ _GEOGRAPHIC, _PROJECTED, _VERTICAL_CRS, _VERTICAL_UNIT = 2048, 3072, 4096, 4099
 
 
 def crs_of_geokeys(directory: bytes, doubles: bytes, text: bytes) -> CRS | None:
-    """Turn the three GeoTIFF records of a LAS file into a CRS.
+    """Return the CRS of the three GeoTIFF records of a LAS file.
 
     The keys are wrapped into a TIFF of one pixel that GDAL then opens: it knows user-defined
     projections, angular units and compound systems, which a look-up of EPSG codes does not.
@@ -60,7 +60,7 @@ def _simple_keys(directory: bytes) -> dict[int, int]:
 
 
 def _with_vertical_key(crs: CRS, keys: dict[int, int]) -> CRS:
-    """Add the vertical CRS where GDAL gave a horizontal one only although a key names both."""
+    """Return the CRS with the vertical part that a key names, where GDAL gave a horizontal one only."""
     from pyproj import CRS
     from pyproj.crs import CompoundCRS
 
@@ -73,7 +73,7 @@ def _with_vertical_key(crs: CRS, keys: dict[int, int]) -> CRS:
 
 
 def _tiff(directory: bytes, doubles: bytes, text: bytes) -> bytes:
-    """Write a TIFF of one pixel that carries the keys."""
+    """Return a TIFF of one pixel that carries the keys."""
     entries: list[tuple[int, int, bytes]] = [
         (256, _SHORT, struct.pack("<H", 1)),
         (257, _SHORT, struct.pack("<H", 1)),

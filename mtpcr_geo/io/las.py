@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -14,10 +13,11 @@ import laspy
 import lazrs
 import numpy as np
 from laspy import DecompressionSelection as Fields
-from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 from mtpcr_geo.core.errors import InputError
+from mtpcr_geo.core.system import sha256
 from mtpcr_geo.io.dimensions import las_table, noise_of_record
 from mtpcr_geo.io.vlr import Record, crs_of_records, read_records
 
@@ -96,7 +96,30 @@ class LasCloud(Cloud):
                 left -= len(record)
                 yield record
 
-    def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[NDArray[np.float64]]:
+    def records_at(
+        self, places: Sequence[int], size: int, fields: Fields | None = None
+    ) -> Iterator[laspy.ScaleAwarePointRecord]:
+        """Yield up to `size` points from each of some places of the file, without reading what is between.
+
+        Args:
+            places: indices of the first point of each part, 0 to `count` - 1.
+            size: points a part, at most.
+            fields: as in `record_chunks`.
+
+        Raises:
+            InputError: if the file is truncated or damaged.
+
+        """
+        chosen = Fields.all() if fields is None else fields
+        with (
+            _reported(self.path),
+            laspy.open(self.path, read_evlrs=False, decompression_selection=chosen) as reader,
+        ):
+            for place in places:
+                reader.seek(place)
+                yield reader.read_points(min(size, self.count - place))
+
+    def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
         """Yield (n, 3) float64 coordinates in the file's CRS and units, n <= size.
 
         Raises:
@@ -106,9 +129,7 @@ class LasCloud(Cloud):
         for record in self.record_chunks(size, _XYZ):
             yield xyz_of(record)
 
-    def noise_chunks(
-        self, size: int = CHUNK_POINTS
-    ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
+    def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, Mask]]:
         """Yield coordinates (n, 3) and which of them are noise or withheld (n,)."""
         for record in self.record_chunks(size, _XYZ_AND_CLASS):
             yield xyz_of(record), noise_of_record(record)
@@ -119,7 +140,7 @@ class LasCloud(Cloud):
             yield las_table(record, xyz_of(record))
 
 
-def xyz_of(record: Any) -> NDArray[np.float64]:
+def xyz_of(record: Any) -> Floats:
     """Return the (n, 3) float64 coordinates of a laspy point record."""
     xyz = np.empty((len(record), 3))
     for axis, name in enumerate("XYZ"):
@@ -132,7 +153,7 @@ def open_cloud(path: str | Path, crs: CRS | None = None) -> LasCloud:
     """Open a LAS 1.0-1.4, LAZ or COPC file; nothing but its header is read.
 
     Args:
-        path: the file; its content says what it is, not its suffix.
+        path: the file; its content decides what it is, not its suffix.
         crs: coordinate reference system to take instead of what the file states.
 
     Raises:
@@ -158,7 +179,7 @@ def open_cloud(path: str | Path, crs: CRS | None = None) -> LasCloud:
 
 
 def _check_head(stream: BinaryIO) -> None:
-    """Check the counts at the head of the file before anything reads as much as they say.
+    """Check the counts at the head of the file before anything is read by them.
 
     Raises:
         ValueError: if the file cannot hold what they promise.
@@ -189,7 +210,7 @@ def _check_size(path: Path, header: laspy.LasHeader) -> None:
 
 
 def _check_chunk_table(stream: BinaryIO, header: laspy.LasHeader, records: list[Record]) -> None:
-    """Check what says where the compressed chunks lie: lazrs ends the whole process on absurd sizes.
+    """Check the table of the compressed chunks: lazrs ends the whole process on absurd sizes.
 
     Raises:
         ValueError: if the table contradicts the file.
@@ -246,12 +267,6 @@ def _reported(path: Path) -> Iterator[None]:
 def _damaged(path: Path, error: BaseException) -> InputError:
     detail = (str(error).splitlines() or [type(error).__name__])[0]
     return InputError(f"{path} is truncated or damaged ({detail}); copy or download it again")
-
-
-def sha256(path: str | Path) -> str:
-    """Hash a file's content, as 64 hexadecimal digits."""
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def check_distinct(target: Cloud, source: Cloud) -> None:

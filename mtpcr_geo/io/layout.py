@@ -13,16 +13,17 @@ from laspy.vlrs.known import ExtraBytesStruct, ExtraBytesVlr
 from numpy.typing import NDArray
 
 import mtpcr_geo
-from mtpcr_geo.core.cloud import Cloud, PointTable
+from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.cloud import Cloud, PointTable, flags_of_table
 from mtpcr_geo.core.errors import InputError
-from mtpcr_geo.io.dimensions import LEGACY_OVERLAP, PDAL_NAMES, SCAN_ANGLE_STEP, split_classification
+from mtpcr_geo.io.dimensions import LEGACY_OVERLAP, PDAL_NAMES, SCAN_ANGLE_STEP
 from mtpcr_geo.io.las import LasCloud, xyz_of
 from mtpcr_geo.io.vlr import EXTRA_BYTES, WKT_RECORD, Record
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-Chunk = tuple[NDArray[np.float64], NDArray[Any]]  # coordinates (n, 3), and the rest as packed records (n,)
+Chunk = tuple[Floats, NDArray[Any]]  # coordinates (n, 3), and the rest as packed records (n,)
 
 # the nearest of the formats 6-10 that has all dimensions of a format 0-5
 MODERN_FORMAT = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10}
@@ -36,7 +37,6 @@ _WAVEFORM = (
     "y_t",
     "z_t",
 )
-_TABLE_FLAGS = {"Synthetic": 0, "KeyPoint": 1, "Withheld": 2, "Overlap": 3}
 _TABLE_ELSEWHERE = {
     *("X", "Y", "Z", "ClassFlags", "ScanAngleRank", "ScanAngle"),
     *PDAL_NAMES.values(),
@@ -46,18 +46,18 @@ _WEEK = 604_800.0
 
 
 def layout(cloud: Cloud, crs: CRS | None) -> tuple[laspy.LasHeader, Iterator[Chunk]]:
-    """Decide how a cloud is written, and stream its points in that layout.
+    """Return how a cloud is written, and its points in that layout.
 
     Args:
         cloud: any cloud; a `LasCloud` keeps its dimensions, extra bytes, identifiers and records.
         crs: what to state as WKT; None states nothing.
 
     Returns:
-        A header that lacks scales, offsets and bounds; and chunks of coordinates with packed records
-        whose X, Y, Z are not filled in.
+        A header that lacks scales, offsets and bounds, and whose GPS time type is settled only when all
+        chunks were taken; and chunks of coordinates with packed records whose X, Y, Z are not filled in.
 
     Raises:
-        InputError: if the cloud has no points, or dimensions that a LAS file cannot hold.
+        InputError: if the cloud has no points, or dimensions or classes that a LAS file cannot hold.
 
     """
     if isinstance(cloud, LasCloud):
@@ -75,7 +75,7 @@ def layout(cloud: Cloud, crs: CRS | None) -> tuple[laspy.LasHeader, Iterator[Chu
 
 
 def wkt_of(crs: CRS) -> str:
-    """Write a CRS as the WKT 1 that LAS 1.4 prescribes, or as WKT 2 where only that can express it."""
+    """Return a CRS as the WKT 1 that LAS 1.4 prescribes, or as WKT 2 where only that can express it."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
@@ -121,7 +121,7 @@ def _vlr(record: Record) -> laspy.VLR:
 
 
 def modern(record: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Turn a laspy record of any point format into packed records of its modern format, X, Y, Z left out.
+    """Return a laspy record of any point format as packed records of its modern format, X, Y, Z left out.
 
     Class 12 of the old formats means overlap: the class stays and the flag of that name is set.
     """
@@ -161,18 +161,27 @@ def _table_layout(cloud: Cloud) -> tuple[laspy.LasHeader, Iterator[Chunk]]:
         point_format.add_extra_dimension(laspy.ExtraBytesParams(name, np.dtype((kind, width))))
     header = laspy.LasHeader(version="1.4", point_format=point_format)
     header.evlrs = laspy.vlrs.vlrlist.VLRList()
-    time = np.asarray(first.get("GpsTime", [0.0]))
-    # a table does not say which kind of time it holds; seconds of a week end at 604800
-    standard = time.size and (time.min() < 0 or time.max() > _WEEK)
-    header.global_encoding.gps_time_type = laspy.header.GpsTimeType(int(bool(standard)))
     for vlr in header.vlrs.get("ExtraBytesVlr"):
         _forget_ranges(vlr)
     header.vlrs.extend(
         laspy.VLR(vlr.user_id, vlr.record_id, vlr.description, vlr.record_data_bytes())
         for vlr in header.vlrs.extract("ExtraBytesVlr")
     )
-    pack = _table_packer(point_format.dtype(), extra)
-    return header, ((_table_xyz(table), pack(table)) for table in chain([first], tables))
+    pack = _table_packer(cloud.name, point_format.dtype(), extra)
+
+    def packed() -> Iterator[Chunk]:
+        for table in chain([first], tables):
+            if _is_standard_time(table):
+                header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
+            yield _table_xyz(table), pack(table)
+
+    return header, packed()
+
+
+def _is_standard_time(table: PointTable) -> bool:
+    """Return whether some time is no second of a week (0-604800), so that it is standard GPS time."""
+    time = np.asarray(table.get("GpsTime", [0.0]), np.float64)
+    return bool(((time < 0) | (time > _WEEK)).any())
 
 
 def _forget_ranges(vlr: ExtraBytesVlr) -> None:
@@ -181,11 +190,13 @@ def _forget_ranges(vlr: ExtraBytesVlr) -> None:
         entry.options &= ~(ExtraBytesStruct.MIN_BIT_MASK | ExtraBytesStruct.MAX_BIT_MASK)
 
 
-def _table_xyz(table: PointTable) -> NDArray[np.float64]:
+def _table_xyz(table: PointTable) -> Floats:
     return np.column_stack([np.asarray(table[axis], np.float64) for axis in "XYZ"])
 
 
-def _table_packer(dtype: np.dtype[Any], extra: Sequence[str]) -> Callable[[PointTable], NDArray[Any]]:
+def _table_packer(
+    cloud_name: str, dtype: np.dtype[Any], extra: Sequence[str]
+) -> Callable[[PointTable], NDArray[Any]]:
     plain = {
         las: pdal
         for las, pdal in PDAL_NAMES.items()
@@ -203,12 +214,13 @@ def _table_packer(dtype: np.dtype[Any], extra: Sequence[str]) -> Callable[[Point
                 new[las] = table[pdal]
         returns = column("ReturnNumber", 1).astype(np.uint8) & 15
         new["bit_fields"] = returns | (column("NumberOfReturns", 1).astype(np.uint8) & 15) << 4
-        classification, flags = split_classification(table)
-        if classification is not None:
-            new["classification"] = classification
+        classification = column("Classification")
+        if ((classification < 0) | (classification > 255)).any():
+            raise InputError(f"{cloud_name} has classes outside 0-255, which LAS cannot hold; map them")
+        new["classification"] = classification
         packed = np.zeros(len(new), np.uint8)
-        for name, place in _TABLE_FLAGS.items():
-            packed |= (flags[name] & 1) << np.uint8(place)
+        for place, flag in enumerate(flags_of_table(table).values()):
+            packed |= flag << np.uint8(place)
         packed |= (column("ScanChannel").astype(np.uint8) & 3) << np.uint8(4)
         packed |= (column("ScanDirectionFlag").astype(np.uint8) & 1) << np.uint8(6)
         packed |= (column("EdgeOfFlightLine").astype(np.uint8) & 1) << np.uint8(7)

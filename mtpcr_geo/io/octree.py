@@ -12,6 +12,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats
+
 Key = tuple[int, int, int, int]  # level, x, y, z
 Cells = NDArray[np.int32]
 
@@ -24,7 +26,7 @@ _GROUP_LEVEL = 6
 _CHUNK = 1_000_000
 
 
-def quantise(xyz: NDArray[np.float64], side: float) -> Cells:
+def quantise(xyz: Floats, side: float) -> Cells:
     """Turn coordinates within a cube, (n, 3) from its low corner, into integers of 30 bits."""
     scaled = np.floor(xyz * (2.0**_BITS / side))
     return np.clip(scaled, 0, 2**_BITS - 1).astype(np.int32)

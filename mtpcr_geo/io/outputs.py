@@ -1,4 +1,4 @@
-"""No half files: outputs are written beside their place and renamed when the run is whole."""
+"""No partial files: outputs are written beside their place and renamed when the run is whole."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mtpcr_geo.core.errors import OutputError
 
 
 class OutputSet:
-    """The files of one run, promised, written under a passing name, and put in place together.
+    """The files of one run, written under temporary names, and put in place together.
 
     Use as a context manager: leaving it by an exception removes everything it wrote, leaving it
     normally without `commit` does too.
@@ -36,7 +36,7 @@ class OutputSet:
         if final.is_dir():
             raise OutputError(f"{final} is a folder; name a file to write")
         if final.exists() and not self.overwrite:
-            raise OutputError(f"{final} exists already; remove it, choose another place, or say --overwrite")
+            raise OutputError(f"{final} exists already; remove it, choose another place, or give --overwrite")
         folder = final.parent
         while not folder.exists():
             folder = folder.parent
@@ -48,7 +48,7 @@ class OutputSet:
             raise OutputError(f"cannot write to {folder}; choose a folder you may write to")
 
     def path(self, final: str | Path) -> Path:
-        """Return the passing name under which to write what shall become `final`.
+        """Return the temporary name under which to write what becomes `final`.
 
         Raises:
             OutputError: as `check`, or if two stages want to write the same file.
@@ -68,7 +68,7 @@ class OutputSet:
         return part
 
     def template(self, final: str | Path) -> Path:
-        """Return the passing name for numbered files: the # in it is for a number, as in PDAL's writers.
+        """Return the temporary name for numbered files: the # in it is for a number, as in PDAL's writers.
 
         Raises:
             OutputError: if the folder cannot be written.
@@ -81,7 +81,7 @@ class OutputSet:
         return part
 
     def adopt(self, final: str | Path) -> None:
-        """Take over the numbered files written under a template's passing name.
+        """Take over the numbered files written under a template's temporary name.
 
         Raises:
             OutputError: if one of them exists and may not be replaced.
@@ -106,11 +106,11 @@ class OutputSet:
             self._made_folders.append(path)
 
     def written(self) -> list[Path]:
-        """Say what has been written so far and waits to be put in place, in order."""
+        """Return what has been written so far and waits to be put in place, in order."""
         return [final for final, part in self._parts.items() if part.exists()]
 
     def commit(self) -> list[Path]:
-        """Put everything in place and say what was written, in order.
+        """Put everything in place; return what was written, in order.
 
         Raises:
             OutputError: if a file cannot be put in place.

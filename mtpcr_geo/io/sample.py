@@ -1,4 +1,4 @@
-"""One streamed look at a whole cloud: is it sound, where does it lie, and a sample to work on."""
+"""One pass over a whole cloud: checks, true bounds, and a sample to work on."""
 
 from __future__ import annotations
 
@@ -8,22 +8,21 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import ComparesArrays, Floats
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud
 from mtpcr_geo.core.errors import InputError
 
 if TYPE_CHECKING:
-    from mtpcr_geo.pipeline.stage import Progress
+    from mtpcr_geo.core.progress import Progress
 
 BUDGET = 4_000_000
 FEWEST_POINTS = 100
-Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Scan:
-    """What one pass over a cloud found.
+@dataclass(frozen=True, eq=False)
+class Scan(ComparesArrays):
+    """Result of one pass over a cloud.
 
     Attributes:
         count: points in the cloud.
@@ -49,13 +48,13 @@ def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progres
     where that fits the budget. Memory is about 40 bytes a point of the budget, whatever the cloud's size.
 
     Args:
-        cloud: what to look at.
+        cloud: what to read.
         budget: most points to keep.
         seed: of the random choice.
         progress: where to report the points read.
 
     Raises:
-        InputError: if the cloud is empty, damaged, not finite, or too poor to be registered.
+        InputError: if the cloud is empty, damaged, not finite, or has too few points to be registered.
 
     """
     if cloud.count == 0:
@@ -83,7 +82,7 @@ def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progres
 
 
 def surface_chunks(cloud: Cloud, size: int = CHUNK_POINTS) -> Iterator[Floats]:
-    """Stream the whole cloud as `scan` sees it: (n, 3) float64 file coordinates, noise left out.
+    """Yield the whole cloud as `scan` reads it: (n, 3) float64 file coordinates, noise left out.
 
     Raises:
         InputError: if the file is truncated or damaged.

@@ -43,7 +43,7 @@ class Record:
 
     @property
     def states_crs(self) -> bool:
-        """Return whether the record is one of those that say the coordinate reference system."""
+        """Return whether the record is one of those that state the coordinate reference system."""
         return self.record_id in _CRS_RECORDS and self.user_id in ("LASF_Projection", "liblas")
 
     @property
@@ -93,12 +93,12 @@ def _text(raw: bytes) -> str:
 
 
 def crs_of_records(records: Sequence[Record]) -> tuple[CRS | None, str]:
-    """Find the CRS that the records state.
+    """Return the CRS that the records state.
 
     WKT comes before GeoTIFF keys; a record behind the points counts like one before them.
 
     Returns:
-        The CRS, or None; and where there is None, why ("" if the file simply says nothing).
+        The CRS, or None; and where there is None, why ("" if the file states nothing).
 
     """
     from pyproj import CRS

@@ -12,6 +12,7 @@ import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.io.las import LasCloud
@@ -21,9 +22,8 @@ from mtpcr_geo.io.waveform import append_waveforms
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from mtpcr_geo.pipeline.stage import Progress
+    from mtpcr_geo.core.progress import Progress
 
-Floats = NDArray[np.float64]
 Move = Callable[[Floats], Floats]
 STEP, FINEST_STEP = 0.001, 0.0001  # metres or feet
 DEGREE_STEP = 1e-9  # a tenth of a millimetre, and 32 bits still span four degrees
@@ -47,14 +47,14 @@ def write_cloud(
     of points; COPC, which has to be sorted, spools to a temporary file beside the output.
 
     Args:
-        path: where to write; ``.las``, ``.laz`` or ``.copc.laz`` says the format.
+        path: where to write; ``.las``, ``.laz`` or ``.copc.laz`` is the format.
         cloud: what to write.
         move: takes (n, 3) file coordinates of `cloud` to those to be written; None leaves them.
         crs: CRS of the written coordinates; None states none.
-        scale: size of the last digit, in units of `crs`; None takes 0.001, or the input's own if that is
+        scale: storage step of coordinates, in units of `crs`; None takes 0.001, or the input's own if that is
             finer, down to 0.0001. For geographic coordinates 1e-9 degrees.
         progress: where to report the points written.
-        advance: is called with the number of points of each chunk written.
+        advance: called with the number of points of each chunk written.
 
     Raises:
         OutputError: if the file cannot be written, or the coordinates do not fit the scale.
@@ -90,13 +90,13 @@ def write_cloud(
 
 
 def is_copc(path: Path) -> bool:
-    """Return by its name whether a file shall be COPC: ``.copc.laz``, also while it has its passing name."""
+    """Return by its name whether a file shall be COPC: ``.copc.laz``, also under its temporary name."""
     suffixes = [suffix.lower() for suffix in path.suffixes]
     return suffixes[-1:] == [".laz"] and ".copc" in suffixes
 
 
 def returning_scales(cloud: Cloud, crs: CRS | None) -> Floats:
-    """Choose scales (3,) fine enough that a cloud can be moved, written, and moved back onto its own digits.
+    """Return scales (3,) so fine that a cloud can be moved, written, and moved back onto its coordinates.
 
     A rotation puts up to 1.4 steps of error on a coordinate by there and back, so the step is a tenth of
     the input's, within 0.00001 and 0.001 metres (or feet), as long as the cloud's extent allows it.
@@ -129,12 +129,14 @@ def _write_las(path: Path, header: laspy.LasHeader, chunks: Iterator[NDArray[Any
             writer.write_points(laspy.PackedPointRecord(chunk, header.point_format))
         if header.evlrs:
             writer.write_evlrs(header.evlrs)
+        # the writer has a copy of the header, which it writes again when it closes
+        writer.header.global_encoding.gps_time_type = header.global_encoding.gps_time_type
 
 
 def _of_one_channel(chunks: Iterator[NDArray[Any]]) -> Iterator[NDArray[Any]]:
     """Pass on points with waveforms, unless their scanner channels are mixed.
 
-    lazrs up to 0.8 garbles the wave packets of such points without a word.
+    lazrs up to 0.8 garbles the wave packets of such points without an error.
     """
     seen: set[int] = set()
     for chunk in chunks:
@@ -146,9 +148,9 @@ def _of_one_channel(chunks: Iterator[NDArray[Any]]) -> Iterator[NDArray[Any]]:
         yield chunk
 
 
-def _scales(cloud: Cloud, crs: CRS | None, said: float | tuple[float, float, float] | None) -> Floats:
-    if said is not None:
-        return np.broadcast_to(np.asarray(said, np.float64), 3).copy()
+def _scales(cloud: Cloud, crs: CRS | None, given: float | tuple[float, float, float] | None) -> Floats:
+    if given is not None:
+        return np.broadcast_to(np.asarray(given, np.float64), 3).copy()
     scales = np.full(3, STEP)
     if isinstance(cloud, LasCloud) and not (cloud.crs is not None and cloud.crs.is_geographic):
         scales = np.clip(cloud.header.scales, FINEST_STEP, STEP)
@@ -176,9 +178,9 @@ def _placed(
         steps = np.rint((moved - header.offsets) / scales)
         worst = float(np.abs(steps).max())
         if not worst <= _INT32:
-            reach = float(np.abs(moved - header.offsets).max())
+            distance = float(np.abs(moved - header.offsets).max())
             raise OutputError(
-                f"a point {reach:.0f} from the others does not fit a LAS file at scale {scales.min():g}; "
+                f"a point {distance:.0f} from the others does not fit a LAS file at scale {scales.min():g}; "
                 "give a coarser scale, or remove stray points"
             )
         for axis, name in enumerate("XYZ"):

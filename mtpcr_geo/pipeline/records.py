@@ -76,7 +76,7 @@ class InputFile:
             InputError: if the file has changed or gone since.
 
         """
-        from mtpcr_geo.io.las import sha256
+        from mtpcr_geo.core.system import sha256
 
         if not self.path.is_file() or InputFile.of(self.path) != replace(self, sha256=None):
             raise InputError(f"{self.path} has changed since it was read; run again")

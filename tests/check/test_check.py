@@ -92,12 +92,21 @@ def test_sound_clouds_have_no_findings(good):
     assert report.relation.source_share > 0.95
     assert 0.65 < report.relation.target_share < 0.85
     facts = report.clouds["target"]
-    assert facts["crs_code"] == "EPSG:25832"
-    assert facts["horizontal_unit"] == facts["vertical_unit"] == "metre"
-    assert facts["points"] == 20_000
-    assert facts["density_per_m2"] == pytest.approx(20_000 / (200 * 160), rel=0.15)
-    assert facts["extent_m"][:2] == pytest.approx([200, 160], abs=0.1)
+    assert facts.crs_code == "EPSG:25832"
+    assert facts.horizontal_unit == facts.vertical_unit == "metre"
+    assert facts.points == 20_000
+    assert facts.density_per_m2 == pytest.approx(20_000 / (200 * 160), rel=0.15)
+    assert facts.extent_m[:2] == pytest.approx([200, 160], abs=0.1)
     assert list(report.clouds) == ["source", "target"]
+
+
+def test_the_time_type_is_judged_by_times_from_all_over_the_file(tmp_path):
+    times = np.full(20_000, 3e8)
+    times[:12_000] = 1000.0
+    standard = write(tmp_path / "standard.laz", hills(1), gps_time=times)
+    assert "gps-time" not in codes(check_clouds(standard))
+    week = patched(write(tmp_path / "week.laz", hills(1), gps_time=times), 6, "<H", 16)
+    assert "300000000.0" in only(check_clouds(week), "gps-time").what
 
 
 def test_one_cloud_alone(good, tmp_path):
@@ -256,22 +265,22 @@ def test_the_fix_mends_it(name, tmp_path, monkeypatch):
     assert result.exit_code == 0, result.output
     after = check_clouds("new.laz")
     assert after.findings == ()
-    assert after.clouds["source"]["crs_code"] == "EPSG:25832"
+    assert after.clouds["source"].crs_code == "EPSG:25832"
 
 
 def test_epoch_of_the_coordinates(tmp_path):
     xyz = hills(1, place=(8.0, 49.0, 100.0), size=(0.01, 0.01))
     wkt = f"COORDINATEMETADATA[{CRS.from_epsg(9000).to_wkt()},EPOCH[2021.3]]"
     report = check_clouds(write(tmp_path / "a.las", xyz, wkt, scale=1e-7), source_crs="EPSG:9000")
-    assert report.clouds["source"]["epoch"] == 2021.3
-    assert report.clouds["source"]["datum_epoch"] == 2010
+    assert report.clouds["source"].epoch == 2021.3
+    assert report.clouds["source"].datum_epoch == 2010
     assert "epoch-missing" not in codes(report)
 
 
 def test_what_the_user_says_stands_over_the_file(good, tmp_path):
     report = check_clouds(good[0], source_crs="EPSG:25833")
     assert "ETRS89 / UTM zone 32N" in only(report, "crs-overridden").what
-    assert report.clouds["source"]["crs_by"] == "option"
+    assert report.clouds["source"].crs_by == "option"
     assert codes(check_clouds(good[0], source_crs="EPSG:25832")) == []
     assert codes(check_clouds(good[0], local=True)) == ["crs-overridden"]
     odd = write(tmp_path / "odd.las", hills(1), "PROJCS[oops")
@@ -380,7 +389,7 @@ def test_large_clouds_are_judged_by_a_sample(pairs, monkeypatch):
     share = int(only(report, "same-points").what.split()[1].rstrip("%"))
     assert 70 <= share <= 100  # the crop was rounded to a coarser scale, where halves go either way
     assert report.relation.source_share > 0.9
-    assert report.clouds["target"]["maximum"] == check_clouds(pairs["target"]).clouds["source"]["maximum"]
+    assert report.clouds["target"].maximum == check_clouds(pairs["target"]).clouds["source"].maximum
     assert codes(check_clouds(pairs["source"], pairs["target"]), "warning") == []
 
 

@@ -243,7 +243,7 @@ def test_one_site_in_many_systems(target_name, source_name):
     target = written_in(target_crs, target_height, metric_target)
     source = written_in(source_crs, source_height, metric_source)
     if group_of(target_name) is not group_of(source_name):
-        with pytest.raises(CrsError, match=r"heights|way from"):
+        with pytest.raises(CrsError, match=r"heights|operation from"):
             resolve_frames(target, source)
         return
     _, target_link, source_link = resolve_frames(target, source)
@@ -264,7 +264,7 @@ def test_one_site_in_many_systems(target_name, source_name):
     back = np.column_stack(Transformer.from_crs(end, start, always_xy=True).transform(*placed.T))
     assert np.abs(back - wanted).max() < 0.001
     assert np.abs(chain.inverse(chain.forward(source.xyz)) - source.xyz).max() < 1e-3
-    assert target_link.report["operation"]
+    assert target_link.report.operation
 
 
 def test_local_and_missing_crs_give_the_metric_result():
@@ -290,6 +290,33 @@ def test_local_feet_from_an_engineering_crs():
     xyz = site(place=np.zeros(3))
     _, _, link = resolve_frames(ArrayCloud(site(), UTM), ArrayCloud(xyz / FOOT, feet))
     assert np.allclose(link.to_work(xyz / FOOT) + link.origin, xyz, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("crs", "known"),
+    [
+        (UTM, True),
+        (CRS.from_epsg(4979), True),
+        (CRS.from_epsg(4978), True),
+        (None, False),
+        (CRS.from_wkt('LOCAL_CS["site grid",UNIT["metre",1],AXIS["X",EAST],AXIS["Y",NORTH]]'), False),
+        (
+            CRS.from_wkt(
+                'ENGCRS["plant",EDATUM["plant datum"],CS[Cartesian,3],AXIS["x",east],AXIS["y",north],'
+                'AXIS["z",up],LENGTHUNIT["metre",1]]'
+            ),
+            False,
+        ),
+    ],
+)
+def test_an_engineering_crs_is_no_georeference(crs, known):
+    place = {4979: [8.0, 48.7, 100.0], 4978: [4.17e6, 0.59e6, 4.77e6]}.get(crs and crs.to_epsg(), PLACE)
+    spread = [1e-4, 1e-4, 30] if crs is not None and crs.is_geographic else [30, 20, 30]
+    xyz = np.random.default_rng(0).uniform(0, spread, (50, 3)) + place
+    cloud = ArrayCloud(xyz, crs)
+    _, target_link, source_link = resolve_frames(cloud, cloud, local=crs is None)
+    assert target_link.georeferenced is source_link.georeferenced is known
+    assert facts_of(crs).georeferenced is known
 
 
 def test_horizontal_and_vertical_units_apart():
@@ -328,12 +355,12 @@ def test_unequal_heights_are_refused_with_the_ways_out():
         for vertical in ("assume-same", "estimate"):
             _, _, link = resolve_frames(target, source, vertical=vertical)
             assert np.allclose(link.to_work(source.xyz) + link.origin, site(), atol=1e-9)
-            assert any("heights differ" in note for note in link.report["notes"])
+            assert any("heights differ" in note for note in link.report.notes)
 
 
 def test_different_vertical_datums_never_pass_in_silence():
     one, other = compound(UTM, "EPSG:5783"), compound(UTM, "EPSG:5703")  # DHHN92, NAVD88
-    with pytest.raises(CrsError, match="way from"):
+    with pytest.raises(CrsError, match="operation from"):
         resolve_frames(ArrayCloud(site(), one), ArrayCloud(site(), other))
 
 
@@ -365,7 +392,7 @@ def test_vertical_datums_with_an_operation_are_transformed():
     assert np.allclose(difference[:, :2], 0, atol=1e-6)
     assert np.all((difference[:, 2] > -0.03) & (difference[:, 2] < -0.01))
     assert np.allclose(difference[:, 2], (moved_to(one, site(), other) - site())[:, 2], atol=1e-9)
-    assert "EVRF2007" in source_link.report["operation"]
+    assert "EVRF2007" in source_link.report.operation
     assert target_link.pipeline is None
 
 
@@ -387,9 +414,9 @@ def test_operations_agree_with_pyproj_and_are_recorded():
     degrees = moved_to(CRS.from_epsg(4258), source_xyz, CRS.from_epsg(25833))
     again = moved_to(UTM, degrees, CRS.from_epsg(4258))
     assert np.allclose(link.to_work(source_xyz) + link.origin, again, rtol=0, atol=1e-6)
-    assert link.report["accuracy_m"] == 0.0
-    assert link.report["grids"] == []
-    assert "UTM zone 33N" in link.report["operation"]
+    assert link.report.accuracy_m == 0.0
+    assert link.report.grids == ()
+    assert "UTM zone 33N" in link.report.operation
     assert link.departure < 0.01
 
 
@@ -431,8 +458,8 @@ def test_a_map_of_untrue_scale_says_so_and_takes_no_local_source():
         crs = CRS.from_epsg(code)
         target = ArrayCloud(moved_to(crs, metres), crs)
         _, link, _ = resolve_frames(target, target)
-        assert link.report["grid_scale"] == pytest.approx([scale, scale], rel=0.02)
-        assert any("off by that" in note for note in link.report["notes"]) == (code != 25832)
+        assert link.report.grid_scale == pytest.approx([scale, scale], rel=0.02)
+        assert any("off by that" in note for note in link.report.notes) == (code != 25832)
         if code == 25832:
             resolve_frames(target, local, source_crs="local")
         else:

@@ -31,7 +31,7 @@ from helpers_crs import (
 from pyproj import CRS
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.errors import CrsError
+from mtpcr_geo.core.errors import CrsError, OptionError
 from mtpcr_geo.crs import TransformChain, same_place
 from mtpcr_geo.export.apply import apply_transform
 from mtpcr_geo.export.transform import read_transform
@@ -330,3 +330,29 @@ def test_a_prior_finds_a_shift_in_feet(small: Sides, metric: np.ndarray, tmp_pat
     found = run(small, source, target, tmp_path, prior="georef")
     assert found.pair is not None
     assert np.abs(placed(found.pair, source, target) - metric).max() < 0.001
+
+
+SITE_GRID = 'LOCAL_CS["site grid",LOCAL_DATUM["site",0],UNIT["metre",1],AXIS["X",EAST],AXIS["Y",NORTH]]'
+
+
+def test_an_engineering_crs_defines_no_vertical(town_files: tuple[Path, Path], tmp_path: Path) -> None:
+    las = laspy.read(town_files[0])
+    middle = (las.header.mins + las.header.maxs) / 2
+    T_tilted = transforms.about(middle, transforms.tilt_matrix(0.5, np.deg2rad(4.0)))
+    las.x, las.y, las.z = transforms.apply(T_tilted, np.asarray(las.xyz)).T
+    las.write(tmp_path / "tilted.laz")
+    found = register(
+        tmp_path / "tilted.laz", town_files[1], tmp_path / "out", source_crs=SITE_GRID, recording=False
+    )
+    assert found.verdict.name == "accepted"
+    assert found.pair is not None
+    assert found.pair.source.levelling.method != "none"
+    assert found.pair.source.levelling.tilt_deg > 1.0
+    assert found.pair.target.levelling.why == "the CRS defines the vertical"
+
+
+def test_an_engineering_crs_is_no_prior(town_files: tuple[Path, Path], tmp_path: Path) -> None:
+    both = {"source_crs": SITE_GRID, "target_crs": SITE_GRID}
+    for crs in ({"source_crs": SITE_GRID}, {"target_crs": SITE_GRID}, both):
+        with pytest.raises(OptionError, match="needs a CRS on both"):
+            register(*town_files, tmp_path / "out", prior="georef", recording=False, **crs)

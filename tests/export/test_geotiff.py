@@ -77,10 +77,46 @@ def test_overviews_for_large_rasters_only(tmp_path):
         assert file.block_shapes[0] == (256, 256)
         assert file.crs is None
         assert tuple(file.transform)[:6] == (1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
-        small = file.read(1, out_shape=(300, 350))
-        assert abs(small[0, 0] - top[:2, :2].mean()) < 1e-3
     with rasterio.open(tmp_path / "tiny.tif") as file:
         assert file.overviews(1) == []
+
+
+@pytest.mark.parametrize("shape", [(600, 700), (513, 389), (257, 3)])
+def test_overviews_keep_highest_lowest_and_number(tmp_path, shape):
+    rng = np.random.default_rng(2)
+    count = rng.integers(0, 4, shape).astype(np.uint32)
+    count[:8, :8] = 0  # nodata at the two finest overviews, and a block further on
+    count[100:101, :1] = 7
+    top = np.where(count > 0, rng.uniform(0, 9, shape), np.nan).astype(np.float32)
+    bev = Bev(Grid(-10.0, 20.0, 0.5, shape[1], shape[0]), top, top - np.float32(2.0), count)
+    geotiff.write_bev(tmp_path / "bev.tif", bev, WorkFrame(CRS("EPSG:25833"), ORIGIN))
+    assert [file.name for file in tmp_path.iterdir()] == ["bev.tif"]
+    with rasterio.open(tmp_path / "bev.tif") as file:
+        whole = file.read()
+        factors = file.overviews(1)
+        assert factors[0] == 2
+        assert factors == file.overviews(2) == file.overviews(3)
+        assert file.tags()["AREA_OR_POINT"] == "Area"
+        assert file.tags()["LEVELLED"] == "no"
+        assert file.units == ("metre", "metre", "count")
+        assert file.profile["compress"] == "deflate"
+        bounds = file.bounds
+    np.testing.assert_array_equal(whole[0], (top.astype(np.float64) + ORIGIN[2]).astype(np.float32))
+    np.testing.assert_array_equal(whole[2], count)
+    for level, factor in enumerate(factors):
+        with rasterio.open(tmp_path / "bev.tif", overview_level=level) as file:
+            reduced = file.read()
+            assert file.bounds == bounds
+            assert file.profile["compress"] == "deflate"
+        rows, columns = -(-shape[0] // factor), -(-shape[1] // factor)
+        assert reduced.shape == (3, rows, columns)
+        places = [(0, 0), (1, 0), (rows - 1, columns - 1), (100 // factor, 0), (rows // 2, columns // 2)]
+        for row, column in places:
+            part = whole[:, row * factor : (row + 1) * factor, column * factor : (column + 1) * factor]
+            seen = part[:, np.isfinite(part[0])]
+            expected = [seen[0].max(), seen[1].min()] if seen.size else [np.nan, np.nan]
+            np.testing.assert_array_equal(reduced[:, row, column], [*expected, part[2].sum()])
+        assert reduced[2].sum() == count.sum()
 
 
 def test_a_tilted_frame_is_no_crs_and_says_so(tmp_path):

@@ -208,7 +208,7 @@ def test_charts_count_every_tie():
     assert "a &lt;b&gt;" in charts.bars([1.0, 0.0], ["a <b>", "c"])
 
 
-def test_metrics_are_told_with_their_units():
+def test_metrics_have_labels_and_units():
     rows = dict(
         descriptions.metric_rows(
             {
@@ -222,7 +222,8 @@ def test_metrics_are_told_with_their_units():
         )
     )
     assert rows == {
-        "overlap": "4,728 m²", "sigma yaw": "0.02°", "inlier share": "50.0 %", "unknown": "not known",
+        "ground that both see": "4,728 m²", "standard deviation of yaw": "0.02°",
+        "inlier share": "50.0 %", "unknown": "not known",
         "n": "3", "shift": "1.000, 2.000, 3.000 m", "good": "yes", "folds: plan": "0.123 m",
     }  # fmt: skip
 

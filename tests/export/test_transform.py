@@ -14,6 +14,7 @@ from mtpcr_geo.core.errors import CrsError, InputError, OutputError
 from mtpcr_geo.core.types import Pair, Side
 from mtpcr_geo.crs import TransformChain, resolve_frames
 from mtpcr_geo.export.apply import apply_transform
+from mtpcr_geo.export.descriptions import shift_text
 from mtpcr_geo.export.transform import (
     dumps,
     read_transform,
@@ -106,6 +107,20 @@ def a_pair_local(said, source_crs, source_path=None, scale=0.001):
     )
 
 
+def test_the_shift_of_local_clouds_is_in_metres():
+    feet = CRS.from_wkt('LOCAL_CS["site grid",UNIT["foot",0.3048],AXIS["X",EAST],AXIS["Y",NORTH]]')
+    xyz = site() - PLACE
+    clouds = [ArrayCloud(xyz / 0.3048, feet, name=f"{role}.laz") for role in ("target", "source")]
+    frame, target_link, source_link = resolve_frames(*clouds)
+    T = transforms.translation(np.array([1.0, -2.0, 0.5]))
+    sides = [
+        Side(role, cloud, link, link.to_work(cloud.xyz))
+        for role, cloud, link in zip(("target", "source"), clouds, (target_link, source_link), strict=True)
+    ]
+    pair = Pair(target=sides[0], source=sides[1], frame=frame, T_target_source=T)
+    assert shift_text(pair) == "+1.000, -2.000, +0.500 m (x, y, z)"
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_everything_comes_back_from_the_file(tmp_path, kind):
     pair = pair_of(kind)
@@ -114,6 +129,9 @@ def test_everything_comes_back_from_the_file(tmp_path, kind):
     xyz = file_xyz(pair.source.cloud)
     assert np.array_equal(again.forward(xyz), chain.forward(xyz))
     assert np.array_equal(again.T_target_source, T_WORK)
+    for link, link_again in ((chain.source, again.source), (chain.target, again.target)):
+        assert link_again.report.as_dict() == link.report.as_dict()
+        assert link_again.georeferenced is link.georeferenced
     back = again.inverse(again.forward(xyz))
     assert np.allclose(back, xyz, rtol=0, atol=1e-10 if "degrees to" in kind else 1e-6)
 

@@ -14,6 +14,7 @@ from pyproj import CRS
 
 from mtpcr_geo.core.errors import InputError, MtpcrError, OutputError
 from mtpcr_geo.io import ArrayCloud
+from mtpcr_geo.io.dimensions import separate_legacy_flags
 from mtpcr_geo.io.las import check_distinct, open_cloud
 from mtpcr_geo.io.octree import OctreeSorter, Spool, quantise
 from mtpcr_geo.io.sample import scan, surface_chunks
@@ -216,15 +217,59 @@ def test_cloud_from_memory_with_pdal_names(tmp_path):
     assert not np.asarray(table["Synthetic"]).any()
 
 
-def test_flags_of_older_pdal_are_understood(tmp_path):
-    raw = np.full(300, 5, np.uint8)
-    raw[:20] = 2 | 128  # withheld, as PDAL up to 2.5 holds it for point formats 0-5
+def test_classes_above_31_are_classes(tmp_path):
+    raw = np.full(300, 200, np.uint8)
+    raw[:20] = 2 | 128
     cloud = ArrayCloud(random_xyz(300), UTM, extra={"Classification": raw})
+    assert scan(cloud).dropped == 0
+    write_cloud(tmp_path / "out.las", cloud, None, UTM)
+    after = laspy.read(tmp_path / "out.las")
+    assert np.array_equal(after.classification, raw)
+    assert not np.asarray(after.withheld).any()
+    assert not np.asarray(after.synthetic).any()
+
+
+@pytest.mark.parametrize("name", ["Withheld", "ClassFlags"])
+def test_flags_are_read_from_their_own_dimensions(tmp_path, name):
+    flags = np.where(np.arange(300) < 20, 1 if name == "Withheld" else 4, 0).astype(np.uint8)
+    extra = {"Classification": np.full(300, 200, np.uint8), name: flags}
+    cloud = ArrayCloud(random_xyz(300), UTM, extra=extra)
     assert scan(cloud).dropped == 20
     write_cloud(tmp_path / "out.las", cloud, None, UTM)
     after = laspy.read(tmp_path / "out.las")
     assert np.array_equal(np.flatnonzero(after.withheld), np.arange(20))
-    assert np.asarray(after.classification).max() == 5
+    assert set(np.asarray(after.classification)) == {200}
+
+
+def test_a_class_that_las_cannot_hold_is_refused(tmp_path):
+    # 263 is 7 in eight bits, and no noise
+    cloud = ArrayCloud(random_xyz(300), UTM, extra={"Classification": np.full(300, 263)})
+    assert scan(cloud).dropped == 0
+    with pytest.raises(InputError, match="0-255"):
+        write_cloud(tmp_path / "out.las", cloud, None, UTM)
+
+
+def test_flags_of_older_pdal_are_separated_by_who_knows_the_file():
+    table = {"X": np.zeros(4), "Classification": np.array([5, 2 | 128, 12 | 32, 6 | 64], np.uint8)}
+    separate = separate_legacy_flags(table)
+    assert separate["Classification"].tolist() == [5, 2, 12, 6]
+    assert separate["Withheld"].tolist() == [0, 1, 0, 0]
+    assert separate["Synthetic"].tolist() == [0, 0, 1, 0]
+    assert separate["KeyPoint"].tolist() == [0, 0, 0, 1]
+    with_flags = {**table, "ClassFlags": np.zeros(4, np.uint8)}
+    assert separate_legacy_flags(with_flags) is with_flags
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz", "copc.laz"])
+@pytest.mark.parametrize("standard", [True, False])
+def test_gps_time_type_is_that_of_all_points(tmp_path, monkeypatch, suffix, standard):
+    monkeypatch.setattr(ArrayCloud.table_chunks, "__defaults__", (100,))
+    times = np.full(300, 5.0)
+    times[250:] = 3e8 if standard else 604_000.0
+    cloud = ArrayCloud(random_xyz(300), UTM, extra={"GpsTime": times})
+    path = tmp_path / f"out.{suffix}"
+    write_cloud(path, cloud, None, UTM)
+    assert open_cloud(path).header.global_encoding.gps_time_type == int(standard)
 
 
 @pytest.mark.parametrize("geokeys", [True, False])

@@ -15,6 +15,7 @@ from conftest import REPOSITORY
 
 import mtpcr_geo
 from mtpcr_geo.export.apply import apply_transform
+from mtpcr_geo.io.write import write_cloud
 from mtpcr_geo.registration import register
 
 
@@ -146,6 +147,28 @@ def test_our_las_reader_and_crop_give_what_pdal_gives(pdal, town_files):
     theirs = run_pdal(pdal, stages)
     for name in ("X", "Y", "Z", "Intensity", "Classification", "GpsTime", "ReturnNumber", "PointSourceId"):
         np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
+
+
+def test_classes_and_flags_of_points_that_pdal_reads(pdal, tmp_path):
+    rng = np.random.default_rng(5)
+    xyz = rng.uniform(0, 50, (300, 3)).round(3)
+    rows = [f"{x},{y},{z},200" for x, y, z in xyz]
+    (tmp_path / "points.csv").write_text("\n".join(["X,Y,Z,Classification", *rows]) + "\n")
+    las = laspy.LasData(laspy.LasHeader(point_format=1, version="1.2"))
+    las.header.scales = np.full(3, 0.001)
+    las.x, las.y, las.z = xyz.T
+    las.classification = np.full(300, 5, np.uint8)
+    las.withheld = np.arange(300) < 20
+    las.write(tmp_path / "old.las")
+    every = {"type": "filters.range", "limits": "Z[0:100]", "tag": "last"}
+    for reader, name, noise, kind in (("text", "points.csv", 0, 200), ("las", "old.las", 20, 5)):
+        stages = [{"type": f"readers.{reader}", "filename": str(tmp_path / name)}, every]
+        cloud = run_ours(stages).stages["last"]
+        assert sum(int(mask.sum()) for _, mask in cloud.noise_chunks()) == noise
+        write_cloud(tmp_path / "out.las", cloud, None, None)
+        after = laspy.read(tmp_path / "out.las")
+        assert set(np.asarray(after.classification)) == {kind}
+        assert int(np.asarray(after.withheld).sum()) == noise
 
 
 def test_moved_cloud_goes_on_in_pdal(pdal, town_files, tmp_path):

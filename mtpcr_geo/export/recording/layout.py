@@ -1,4 +1,4 @@
-"""How a recording is laid out in the rerun viewer: its blueprint, built from what was recorded."""
+"""The layout of a recording in the rerun viewer: its blueprint, built from what was recorded."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from mtpcr_geo.core.types import Floats
+from mtpcr_geo.core.arrays import Floats
 
 TIMELINE = "stage"
 
 
-@dataclass
+@dataclass(eq=False)
 class Recorded:
-    """What the layout needs to know about a recording.
+    """What a recording holds, as far as the layout depends on it.
 
     Attributes:
         paths: entities that hold something.
-        bounds: (2, 3) lowest and highest coordinates by entity root, metres, for the first look.
+        bounds: (2, 3) lowest and highest coordinates by entity root, metres, for the first view.
         images: (width, height) in pixels by entity root.
 
     """
@@ -47,7 +47,7 @@ def layout(recorded: Recorded) -> Any:
         _map(recorded),
     ]
     shown = [tab for tab in tabs if tab is not None]
-    words = rrb.Vertical(
+    texts = rrb.Vertical(
         rrb.Tabs(
             rrb.TextDocumentView(origin="summary", name="Verdict"),
             rrb.TextDocumentView(origin="run", name="Options and versions"),
@@ -59,7 +59,7 @@ def layout(recorded: Recorded) -> Any:
         row_shares=[3, 1],
     )
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Tabs(*shown, active_tab=0), words, column_shares=[5, 2]) if shown else words,
+        rrb.Horizontal(rrb.Tabs(*shown, active_tab=0), texts, column_shares=[5, 2]) if shown else texts,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
@@ -97,14 +97,14 @@ def _rasters(recorded: Recorded) -> Any:
         ("height", "heights"),
     )
     grids = []
-    for kind, words in kinds:
+    for kind, title in kinds:
         views = [
-            _flat(recorded, f"bev/{role}/{kind}", f"{role.capitalize()}: {words}")
+            _flat(recorded, f"bev/{role}/{kind}", f"{role.capitalize()}: {title}")
             for role in ("source", "target")
         ]
         shown = [view for view in views if view is not None]
         if shown:
-            grids.append(rrb.Horizontal(*shown, name=words.capitalize()))
+            grids.append(rrb.Horizontal(*shown, name=title.capitalize()))
     return rrb.Tabs(*grids, name="Rasters") if grids else None
 
 
@@ -138,8 +138,8 @@ def _keypoints(recorded: Recorded) -> Any:
             grids.append(rrb.Grid(*views, grid_columns=2, name=title))
     if recorded.has("sweep"):
         charts = [
-            rrb.BarChartView(origin=f"sweep/{what}", name=f"{words} by turn of the source, degrees")
-            for what, words in (("agreeing", "Agreeing matches"), ("matches", "Matches"))
+            rrb.BarChartView(origin=f"sweep/{what}", name=f"{title} by rotation of the source, degrees")
+            for what, title in (("agreeing", "Agreeing matches"), ("matches", "Matches"))
         ]
         grids.append(rrb.Vertical(*charts, name="Sweep"))
     return rrb.Tabs(*grids, name="Keypoints") if grids else None
@@ -162,7 +162,7 @@ def _ties(recorded: Recorded) -> Any:
         recorded, "aligned", "Tie points by residual: green fits, red does not", hide=("source", "links")
     )
     chart = rrb.BarChartView(origin="residuals", name="Tie points by residual in centimetres")
-    return rrb.Vertical(space, chart, row_shares=[3, 1], name="TiePoints")
+    return rrb.Vertical(space, chart, row_shares=[3, 1], name="Tie points")
 
 
 def _inputs(recorded: Recorded) -> Any:
@@ -191,11 +191,11 @@ def _space(recorded: Recorded, origin: str, name: str, hide: tuple[str, ...] = (
     bounds = recorded.bounds.get(origin)
     if bounds is not None:
         middle = bounds.mean(axis=0)
-        reach = float(np.linalg.norm(bounds[1, :2] - bounds[0, :2])) or 10.0
+        width = float(np.linalg.norm(bounds[1, :2] - bounds[0, :2])) or 10.0
         eye = rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=middle + away * reach * np.array([0.0, -0.46, 0.5]),
-            look_target=middle - reach * np.array([0.0, 0.03, 0.0]),
+            position=middle + away * width * np.array([0.0, -0.46, 0.5]),
+            look_target=middle - width * np.array([0.0, 0.03, 0.0]),
             eye_up=(0.0, 0.0, 1.0),
         )
     return rrb.Spatial3DView(

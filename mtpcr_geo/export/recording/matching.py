@@ -1,4 +1,4 @@
-"""What keypoint matching leaves in a recording: images, keypoints, the sweep, FOCUS before and after."""
+"""What a recording shows of keypoint matching: images, keypoints, the sweep, FOCUS before and after."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from mtpcr_geo.core.types import Floats, Pair, Side
+from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.types import Pair, Side
 from mtpcr_geo.export import drawing
 
 _IMAGE_SIDE = 2048

@@ -23,7 +23,7 @@ class RerunRecorder:
     versions and options are recording properties.
 
     Args:
-        path: the file to write; put in place by whoever gave the name.
+        path: the file to write; renamed by the caller once the run is whole.
         budget: points a cloud and picture at most; larger clouds are thinned by a seeded choice.
         seed: of the thinning.
 

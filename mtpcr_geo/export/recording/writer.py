@@ -1,4 +1,4 @@
-"""What goes into a recording, stage by stage, and under which name. Needs rerun; imported late."""
+"""The content of a recording, stage by stage, by entity path. Needs rerun, and is imported only when used."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from mtpcr_geo import __version__
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
-from mtpcr_geo.core.types import Floats, Pair, Side
+from mtpcr_geo.core.types import Pair, Side
 from mtpcr_geo.export import descriptions, drawing
 from mtpcr_geo.export.recording import matching
 from mtpcr_geo.export.recording.layout import TIMELINE, Recorded, layout
@@ -359,11 +360,11 @@ class RecordingWriter:
                 parts.append(
                     f"## {name.capitalize()}\n\n" + "\n".join(f"- {descriptions.plain(v)}" for v in value)
                 )
-        return "\n\n".join(parts) or "nothing was noted"
+        return "\n\n".join(parts) or "nothing was recorded"
 
 
 def _made(value: object, before: Pair | None) -> str:
-    """Say in some words what a stage newly made."""
+    """Return what a stage newly made, as a short text."""
     if isinstance(value, Cloud):
         return f"a cloud of {value.count:,} points, {Path(value.name).name}"
     if not isinstance(value, Pair):
@@ -387,7 +388,7 @@ def _made(value: object, before: Pair | None) -> str:
 
 
 def _bounds(xyz: Floats) -> Floats:
-    """(2, 3) bounds of the middle 98 % in plan, so that stray points do not shrink the first look."""
+    """Return the (2, 3) bounds of the middle 98 %, so that stray points do not shrink the first view."""
     if len(xyz) == 0:
         return np.zeros((2, 3))
     return np.asarray(np.percentile(xyz[:: max(1, len(xyz) // 20_000)], [1.0, 99.0], axis=0))

@@ -1,4 +1,4 @@
-"""The report: one HTML file about a run that anybody can open, with no other file and no network."""
+"""The report on a run: one HTML file that needs no other file and no network."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ ul{margin:6px 0;padding-left:20px}
 def write_report(
     path: str | Path, pair: Pair, done: Sequence[Mapping[str, Any]], facts: Mapping[str, Any]
 ) -> None:
-    """Write the report of a run, in whatever state the run ended.
+    """Write the report of a run, whatever state the run ended in.
 
     Args:
         path: the HTML file to write.
@@ -69,7 +69,7 @@ def write_report(
         _head(pair, names),
         _section("What was found", _found(pair)),
         _section("Pictures", _pictures(pair)),
-        _section("How sure it is", _checks(pair)),
+        _section("How certain it is", _checks(pair)),
         _section("The transform", _transform(pair)),
         _section("The run", _run(done, facts)),
     ]
@@ -129,11 +129,11 @@ def _pictures(pair: Pair) -> str:
         caption = (
             "What was matched: source left, target right. "
             + _key(drawing.GOOD_RGB, "agrees with the transform")
-            + _key(drawing.WITHHELD_RGB, "agrees, and was held out from the solve")
+            + _key(drawing.HELD_OUT_RGB, "agrees, and was held out from the solve")
             + _key(drawing.BAD_RGB, "does not agree")
         )
         if pair.T_target_source is None:
-            caption = "What was matched: source left, target right. No transform came of it."
+            caption = "What was matched: source left, target right. No transform was found from it."
         figures.append(_figure(drawing.matches_picture(pair), caption, wide=True))
     if both and pair.T_target_source is not None:
         source, target = drawing.common_rasters(pair)
@@ -144,7 +144,7 @@ def _pictures(pair: Pair) -> str:
         figures.append(_figure(drawing.edge_overlay(source, target), overlay))
         board = (
             "Source (orange) and target (blue) in turn, in squares of 20 m: "
-            "roofs, kerbs and banks must run on across the borders."
+            "roofs, kerbs and banks must continue across the borders."
         )
         figures.append(_figure(drawing.checkerboard(source, target), board))
     if not figures:
@@ -167,13 +167,13 @@ def _checks(pair: Pair) -> str:
         )
         parts.append(
             f"<figure><h3>Candidate poses</h3>{chart}<figcaption>Score of each pose that the search "
-            "proposed. The first was followed; the further it stands out, the surer it is."
+            "proposed. The first was followed; the more it exceeds the others, the more certain it is."
             "</figcaption></figure>"
         )
     if pair.tie_points is not None and pair.T_target_source is not None and len(pair.tie_points.target):
         parts += _tie_charts(pair)
     if not parts and not checks:
-        return "<p>Nothing to judge by was found.</p>"
+        return "<p>There is nothing to judge the result by.</p>"
     return f'<div class="grid">{checks}<div class="stack">{"".join(parts)}</div></div>'
 
 
@@ -186,13 +186,14 @@ def _tie_charts(pair: Pair) -> list[str]:
     good, bad = drawing.residual_limits(residual, inlier)
     limit = max(2.0 * bad, float(np.percentile(residual, 60)) * 1.2, 0.05)
     colours = drawing.residual_colours(residual, good, bad)
+    plan = charts.residual_map(target, registered, colours, footprints(pair))
     return [
         f"<figure><h3>Residuals of the tie points</h3>{charts.histogram(residual, inlier, limit)}<figcaption>"
         "Distance between both ends of each tie point after the transform."
         f"{_key(drawing.GOOD_RGB, 'agrees')}{_key(drawing.BAD_RGB, 'does not')}</figcaption></figure>",
-        f"<figure><h3>Where they lie</h3>{charts.residual_map(target, registered, colours, footprints(pair))}"
+        f"<figure><h3>Tie points in plan</h3>{plan}"
         f"<figcaption>Tie points in plan, green below {good:g} m of residual, red from {bad:g} m; lines show "
-        "its direction. Lines that all point one way or turn about a place would mean that the transform is "
+        "its direction. Lines that all point one way, or around one place, would mean that the transform is "
         f"off.{_key(drawing.SOURCE_RGB, 'source')}{_key(drawing.TARGET_RGB, 'target')}</figcaption></figure>",
     ]
 
@@ -216,7 +217,7 @@ def _transform(pair: Pair) -> str:
         before, after = (", ".join(f"{value:.3f}" for value in point) for point in example)
         parts.append(
             f"<p>Worked example, the middle of the source: <code>{before}</code> becomes "
-            f"<code>{after}</code>. A program that uses the matrix in another way gets another result.</p>"
+            f"<code>{after}</code>. Use it to check a program to which you give the matrix.</p>"
         )
     origins = "; ".join(
         f"{side.role} {', '.join(f'{value:.0f}' for value in side.link.origin)}"
@@ -225,7 +226,7 @@ def _transform(pair: Pair) -> str:
     work = pair.frame.crs.name if pair.frame.crs is not None else "local"
     parts += [
         f"<h3>In the work frame: {escape(work)}</h3>",
-        "<p>Metres, on coordinates from which each cloud's work origin was taken away first "
+        "<p>Metres, on coordinates from which the origin of each cloud's work frame is subtracted first "
         f"({escape(origins)}).</p><pre>{descriptions.matrix_text(pair.T_target_source)}</pre>",
     ]
     return "".join(parts)
@@ -260,7 +261,7 @@ def _run(done: Sequence[Mapping[str, Any]], facts: Mapping[str, Any]) -> str:
     rows = [(str(entry.get("tag", "")), _stage_note(entry)) for entry in done]
     if rows:
         parts.append(f'<div class="wide"><h3>Stages and their options</h3>{_table(rows)}</div>')
-    return f'<div class="grid">{"".join(parts)}</div>' if parts else "<p>Nothing was noted.</p>"
+    return f'<div class="grid">{"".join(parts)}</div>' if parts else "<p>Nothing was recorded.</p>"
 
 
 def _stage_note(entry: Mapping[str, Any]) -> str:

@@ -6,7 +6,6 @@ folder, and matches with ``--matcher NAME``. The package ships no weights.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import tomllib
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from mtpcr_geo.core.errors import MissingPartError, OptionError
+from mtpcr_geo.core.system import sha256
 
 VARIABLE = "MTPCR_GEO_MODELS"
 
@@ -191,12 +191,6 @@ def inventory(folder: Path | None) -> Iterator[dict[str, Any]]:
             "terms": model.origin.terms,
             "project": model.origin.project,
         }
-
-
-def sha256(path: Path) -> str:
-    """Return the sha256 of a file, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _text(path: Path) -> str:

@@ -12,11 +12,20 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 from mtpcr_geo.core.errors import InputError
+from mtpcr_geo.io.dimensions import separate_legacy_flags
 from mtpcr_geo.io.las import LasCloud
 from mtpcr_geo.io.views import Moved, xyz_of
 from mtpcr_geo.io.write import write_cloud
 from mtpcr_geo.pipeline.pdal import library
-from mtpcr_geo.pipeline.pdal.step import Step, failure, file_written, is_writer, numbered_files, stage_json
+from mtpcr_geo.pipeline.pdal.step import (
+    Step,
+    failure,
+    file_written,
+    is_reader,
+    is_writer,
+    numbered_files,
+    stage_json,
+)
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -81,7 +90,14 @@ class PdalCloud(Cloud):
         for records in self._held if self._held is not None else self._stream(self._again, size):
             for start in range(0, len(records), size):
                 part = records[start : start + size]
-                yield {name: part[name] for name in part.dtype.names or ()}
+                table = {name: part[name] for name in part.dtype.names or ()}
+                yield separate_legacy_flags(table) if self._reads_las_alone else table
+
+    @property
+    def _reads_las_alone(self) -> bool:
+        """Return whether all points are from LAS files: PDAL before 2.6 leaves flags in their class byte."""
+        readers = [step for step in self._steps if is_reader(step.spec)]
+        return bool(readers) and all(step.spec.type == "readers.las" for step in readers)
 
     def _chain(self, context: RunContext) -> list[dict[str, Any]]:
         """Return the chain in PDAL's JSON, without the writers that have written already."""

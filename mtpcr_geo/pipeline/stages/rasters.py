@@ -101,7 +101,7 @@ class Level(Stage):
         roles: tuple[Literal["target", "source"], ...] = ("target", "source")
         for role, cloud, link, scanned in zip(roles, clouds, links, found, strict=False):
             sample = in_work_frame(link, scanned.sample)
-            levelling = level(sample, options.method, link.file_crs is not None, options.seed)
+            levelling = level(sample, options.method, link.georeferenced, options.seed)
             self.metadata[role] = {
                 "points": scanned.count,
                 "noise_points": scanned.dropped,

@@ -24,7 +24,7 @@ def georeference(pair: Pair, label: str) -> Floats:
         OptionError: if a cloud has no CRS to claim it by.
 
     """
-    if pair.frame.crs is None or pair.source.link.file_crs is None:
+    if not (pair.target.link.georeferenced and pair.source.link.georeferenced):
         raise OptionError(
             f"{label}: a prior from the georeference needs a CRS on both clouds; name it by --source-crs and "
             "--target-crs, or search without a prior"

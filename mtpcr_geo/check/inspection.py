@@ -1,0 +1,52 @@
+"""What a check knows of one cloud, gathered step by step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mtpcr_geo.core.arrays import Floats
+
+if TYPE_CHECKING:
+    from mtpcr_geo.check.findings import CloudRole
+    from mtpcr_geo.check.place import Claim
+    from mtpcr_geo.check.points import Measured
+    from mtpcr_geo.core.errors import RegistrationError
+    from mtpcr_geo.io.las import LasCloud
+    from mtpcr_geo.io.sample import Scan
+
+
+@dataclass(eq=False)
+class Inspection:
+    """What a check found out about one cloud.
+
+    Attributes:
+        role: "source" or "target".
+        cloud: the opened file.
+        claim: the CRS it is taken to be in.
+        scan: its sample and true bounds, or None where its points cannot be used.
+        measured: its sample and extent in metres of a frame of its own, or None where no frame is known.
+        too_large: why no raster of it can be made, or None.
+
+    """
+
+    role: CloudRole
+    cloud: LasCloud
+    claim: Claim
+    scan: Scan | None = None
+    measured: Measured | None = None
+    too_large: RegistrationError | None = None
+
+    @property
+    def is_local(self) -> bool:
+        """Return whether its coordinates are known to be local: no CRS, or an engineering one."""
+        return self.claim.facts is not None and not self.claim.facts.georeferenced
+
+    @property
+    def bounds(self) -> Floats:
+        """Return the (2, 3) lowest and highest coordinates: of the points if known, else of the header."""
+        if self.scan is not None:
+            return np.stack([self.scan.minimum, self.scan.maximum])
+        return np.stack([self.cloud.minimum, self.cloud.maximum])

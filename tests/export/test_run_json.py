@@ -1,0 +1,81 @@
+"""What `run.json` holds is what its module lists, key by key."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mtpcr_geo.export import run_json
+from mtpcr_geo.registration import register
+
+KEYS = re.findall(r"^- ``(.+?)``: ", run_json.__doc__ or "", flags=re.M)
+RARE = {
+    "frames",  # null where no pair was made
+    "metrics",  # empty where there is no verdict
+    "metrics.vertical_offset_m",
+    "mtpcr.focus why",
+    "mtpcr.level <role>.plane_to_verticals_deg",
+    "mtpcr.level <role>.verticals_spread_deg",
+}
+WHOLE = {"T_target_source", "pipeline", "stages[].options"}  # described elsewhere, whatever they hold
+
+
+def paths(value: Any, path: str = "") -> Iterator[str]:
+    """All keys of a JSON value with a value that is no object, joined by dots; [] for a list of objects."""
+    if path in WHOLE or re.fullmatch(r"options\.[^.]+", path):
+        yield path
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            yield from paths(inner, f"{path}.{key}" if path else key)
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        for inner in value:
+            yield from paths(inner, path + "[]")
+    else:
+        yield path
+
+
+def keys_of(run: dict[str, Any]) -> set[str]:
+    found = set()
+    for stage in run["stages"]:
+        metadata = stage.pop("metadata")
+        found |= {f"{stage['type']} {path}" for path in paths(metadata)} | {"stages[].metadata"}
+    return found | set(paths(run))
+
+
+def matches(pattern: str, key: str) -> bool:
+    return bool(
+        re.fullmatch(re.sub(r"<\w+>", r"[^. ]+", pattern.replace("[]", r"\[\]").replace(".", r"\.")), key)
+    )
+
+
+@pytest.fixture(scope="module")
+def found_keys(
+    town_files: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, set[str]]:
+    found = {}
+    for name, options in {
+        "correlation": {"source_crs": "local"},
+        "prior": {"prior": "georef"},
+        "keypoints": {"profile": "paper", "matcher": "orb"},
+        "failed": {"matcher": "orb", "cell": 30.0},
+    }.items():
+        out = tmp_path_factory.mktemp(name) / "out"
+        register(*town_files, out, recording=False, **options)
+        found[name] = keys_of(json.loads((out / "run.json").read_text()))
+    return found
+
+
+@pytest.mark.parametrize("name", ["correlation", "prior", "keypoints", "failed"])
+def test_every_key_of_a_run_is_listed(found_keys: dict[str, set[str]], name: str) -> None:
+    assert [key for key in found_keys[name] if not any(matches(one, key) for one in KEYS)] == []
+
+
+def test_every_key_listed_is_in_some_run_but_for_rare_ones(found_keys: dict[str, set[str]]) -> None:
+    seen = set().union(*found_keys.values())
+    missing = {one for one in KEYS if not any(matches(one, key) for key in seen)}
+    assert missing <= RARE
