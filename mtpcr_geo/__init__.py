@@ -14,6 +14,8 @@ package costs next to nothing.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from mtpcr_geo.core.version import __version__
+
 if TYPE_CHECKING:
     from mtpcr_geo.check import check_clouds as check
     from mtpcr_geo.core.cloud import Cloud
@@ -28,7 +30,6 @@ if TYPE_CHECKING:
     from mtpcr_geo.pipeline.api import Pipeline
     from mtpcr_geo.registration import Registration, apply, register
 
-__version__ = "0.1.0"
 __all__ = [
     "Cloud",
     "MtpcrError",

@@ -22,6 +22,7 @@ from pydantic import ValidationError
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.cloud import ArrayCloud, Cloud
 from mtpcr_geo.core.errors import InputError, MissingPartError, OptionError, RegistrationError
+from mtpcr_geo.core.progress import Progress
 from mtpcr_geo.core.types import Floats, Pair, Verdict
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.export.apply import move, moved_by, write_moved
@@ -29,7 +30,7 @@ from mtpcr_geo.io.memory import cloud_of, is_array
 from mtpcr_geo.pipeline.options import OUTPUT_NAMES, RegisterOptions, first_problem
 from mtpcr_geo.pipeline.records import StageRecord
 from mtpcr_geo.pipeline.runner import RunResult, run
-from mtpcr_geo.pipeline.stage import Progress, Stage, chained
+from mtpcr_geo.pipeline.stage import Stage, chained
 from mtpcr_geo.pipeline.stages.memory import MemoryReader
 from mtpcr_geo.pipeline.steps import reader_of, recording_writer, steps_of, writers_of
 

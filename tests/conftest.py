@@ -4,6 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
+from numpy.typing import NDArray
 from pyproj import CRS
 
 from mtpcr_geo.core import transforms
@@ -11,6 +13,19 @@ from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.io.write import write_cloud
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+
+# No deadlines, and no health check that goes by the clock: how long an example takes depends on what else the
+# machine does. The same examples in every run, so that a failure can be repeated; new ones are looked for
+# with `--hypothesis-profile=explore`. A failing example is printed with the line that repeats it.
+settings.register_profile(
+    "repeatable",
+    deadline=None,
+    derandomize=True,
+    print_blob=True,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.register_profile("explore", settings.get_profile("repeatable"), derandomize=False)
+settings.load_profile("repeatable")
 
 
 def _shared(name: str) -> Path:
@@ -51,7 +66,7 @@ def town_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     source = transforms.apply(turn, source[source[:, 0] > -30.0]) + ORIGIN
     files = []
     for name, xyz in (("source", source), ("target", target)):
-        extra = {
+        extra: dict[str, NDArray[np.generic]] = {
             "Intensity": rng.integers(0, 2000, len(xyz)).astype(np.uint16),
             "Classification": np.where(xyz[:, 2] > ORIGIN[2] + 5.0, 6, 2).astype(np.uint8),
             "GpsTime": np.arange(len(xyz)) * 1e-3,

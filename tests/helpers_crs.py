@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from helpers_scene import houses
+from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.crs import BoundCRS, CompoundCRS
 from pyproj.crs.coordinate_operation import ToWGS84Transformation
@@ -83,7 +84,7 @@ class Variant:
         """Write a metric cloud."""
         degrees = self.crs is not None and self.crs.is_geographic
         scale = (1e-9, 1e-9, STEP) if degrees else STEP
-        kinds = {"Classification": np.full(len(xyz), 2, np.uint8)}
+        kinds: dict[str, NDArray[np.generic]] = {"Classification": np.full(len(xyz), 2, np.uint8)}
         cloud = ArrayCloud(self.written(xyz), self.crs, path.name, kinds)
         write_cloud(path, cloud, None, self.crs, scale=scale)
         return path

@@ -33,11 +33,11 @@ class Builder:
         return self.constant(np.array(values, np.int64))
 
     def save(self, path: Path, inputs: dict, outputs: dict) -> Path:
-        described = [
+        taken, made = (
             [helper.make_tensor_value_info(name, *how) for name, how in side.items()]
             for side in (inputs, outputs)
-        ]
-        graph = helper.make_graph(self.nodes, "small", *described, self.constants)
+        )
+        graph = helper.make_graph(self.nodes, "small", taken, made, self.constants)
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
         onnx.checker.check_model(model)
         onnx.save(model, path)
@@ -53,7 +53,7 @@ def features(b: Builder, image: str, wanted: str) -> tuple[str, str, str]:
     W -= W.mean(axis=(2, 3), keepdims=True)
     maps = b("Conv", image, b.constant(W.astype(np.float32)), pads=[7, 7, 7, 7])
     power = b("ReduceMean", b("Mul", maps, maps), axes=[1], keepdims=1)
-    strength = b("Div", power, b("Add", power, b.constant(np.float32(1.0))))
+    strength = b("Div", power, b("Add", power, b.constant(np.array(1.0, np.float32))))
     peak = b("MaxPool", strength, kernel_shape=[5, 5], pads=[2, 2, 2, 2])
     kept = b("Mul", strength, b("Cast", b("Equal", strength, peak), to=FLOAT))
     flat = b("Reshape", kept, b.ints(1, -1))
@@ -73,13 +73,13 @@ def assignment(b: Builder, k0: str, k1: str, d0: str, d1: str) -> tuple[str, str
     W = b.constant((rng.normal(size=(2, DIM)) * 0.01).astype(np.float32))
     a, c = (b("Add", d, b("Tanh", b("MatMul", k, W))) for d, k in ((d0, k0), (d1, k1)))
     similar = b("MatMul", a, b("Transpose", c, perm=[0, 2, 1]))
-    similar = b("Mul", similar, b.constant(np.float32(20.0)))
+    similar = b("Mul", similar, b.constant(np.array(20.0, np.float32)))
     both = b("Mul", b("Softmax", similar, axis=2), b("Softmax", similar, axis=1))
     both = b("Squeeze", both, b.ints(0))
     forth = b("ArgMax", both, axis=1, keepdims=0)
     back = b("ArgMax", both, axis=0, keepdims=0)
     n = b("Squeeze", b("Slice", b("Shape", both), b.ints(0), b.ints(1)), b.ints(0))
-    own = b("Range", b.constant(np.int64(0)), n, b.constant(np.int64(1)))
+    own = b("Range", b.constant(np.array(0, np.int64)), n, b.constant(np.array(1, np.int64)))
     mutual = b("Equal", b("Gather", back, forth, axis=0), own)
     chosen = b("Squeeze", b("NonZero", mutual), b.ints(0))
     pairs = [b("Unsqueeze", b("Gather", one, chosen, axis=0), b.ints(1)) for one in (own, forth)]
@@ -122,9 +122,9 @@ def fused(path: Path, keypoints: int = 100) -> Path:
     b = Builder()
     half = [b("Slice", "images", b.ints(k), b.ints(k + 1), b.ints(0)) for k in (0, 1)]
     found = [features(b, image, b.ints(keypoints)) for image in half]
-    scale = b.constant(np.float32(0.001))
+    scale = b.constant(np.array(0.001, np.float32))
     places = [b("Mul", b("Cast", px, to=FLOAT), scale) for px, _, _ in found]
-    matches, scores = assignment(b, *places, found[0][2], found[1][2])
+    matches, scores = assignment(b, places[0], places[1], found[0][2], found[1][2])
     zero = b("Mul", b("Slice", matches, b.ints(0), b.ints(1), b.ints(1)), b.ints(0))
     b("Concat", zero, matches, name="matches", axis=1)
     b("Identity", scores, name="mscores")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from pyproj import CRS
 
@@ -122,17 +124,16 @@ def make_sides(n: int = 20_000, crs: str | None = "EPSG:25833", tilt: float = 0.
     source_xyz = transforms.apply(transforms.inverse(true_transform()), town(rng, n))
     T_level = transforms.compose(transforms.tilt_matrix(0.4, tilt), np.zeros(3))
     source_xyz = transforms.apply(transforms.inverse(T_level), source_xyz)
-    sides = []
-    for role, xyz, origin, T in (
-        ("target", target_xyz, target_origin, np.eye(4)),
-        ("source", source_xyz, np.zeros(3), T_level),
-    ):
+
+    def side(role: Literal["source", "target"], xyz: np.ndarray, origin: np.ndarray, T: np.ndarray) -> Side:
         side_crs = known if role == "target" else None
         link = FrameLink(side_crs, origin, georeferenced=side_crs is not None)
         cloud = ArrayCloud(link.to_file(xyz), side_crs, f"{role}.laz")
         bev = rasterise(transforms.apply(T, xyz), cell)
-        sides.append(Side(role, cloud, link, xyz, True, Levelling(T, "plane" if tilt else "none"), bev))
-    return sides[0], sides[1]
+        return Side(role, cloud, link, xyz, True, Levelling(T, "plane" if tilt else "none"), bev)
+
+    target = side("target", target_xyz, target_origin, np.eye(4))
+    return target, side("source", source_xyz, np.zeros(3), T_level)
 
 
 def make_pair(
@@ -140,7 +141,7 @@ def make_pair(
     crs: str | None = "EPSG:25833",
     tilt: float = 0.0,
     state: str = "judged",
-    verdict: str = "accepted",
+    verdict: Literal["accepted", "doubtful", "refused"] = "accepted",
     cell: float = 1.0,
 ) -> Pair:
     """A pair that has come as far as `state`: "levelled", "matched", "tied", "solved" or "judged"."""

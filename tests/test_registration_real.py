@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -23,7 +24,7 @@ PAIRS = {
 FAST = ["delft_urban_ahn3", "park_two_epochs_ttp"]
 
 
-def crs_of(name: str) -> dict[str, str]:
+def crs_of(name: str) -> dict[str, Any]:
     return {"source_crs": "EPSG:28992", "target_crs": "EPSG:28992"} if name.startswith("delft") else {}
 
 
@@ -108,5 +109,6 @@ def test_a_far_shift_of_both_changes_nothing(shared_data: Path, tmp_path: Path) 
             local=True, level="none", recording=False,
         )  # fmt: skip
         assert found.pair is not None
+        assert found.pair.T_target_source is not None
         results.append(found.pair.T_target_source)
     assert np.abs(results[0] - results[1]).max() < 1e-6

@@ -30,7 +30,7 @@ from mtpcr_geo.core.progress import NoProgress
 if TYPE_CHECKING:
     from multiprocessing.context import SpawnProcess
 
-    from mtpcr_geo.pipeline.stage import Progress
+    from mtpcr_geo.core.progress import Progress
 
 Row = dict[str, Any]
 RUNS, PROTOCOL, LOG = "runs.jsonl", "protocol.json", "methods.log"

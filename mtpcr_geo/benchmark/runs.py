@@ -25,7 +25,7 @@ from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.io.outputs import OutputSet
 
 if TYPE_CHECKING:
-    from mtpcr_geo.pipeline.stage import Progress
+    from mtpcr_geo.core.progress import Progress
 
 ABLATION = {"RES": "res", "FOCUS": "focus", "IE": "enhance"}
 _STAND_IN_NOTE = (

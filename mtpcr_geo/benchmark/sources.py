@@ -17,7 +17,7 @@ from mtpcr_geo.core.errors import InputError, OptionError
 from mtpcr_geo.core.progress import NoProgress
 
 if TYPE_CHECKING:
-    from mtpcr_geo.pipeline.stage import Progress
+    from mtpcr_geo.core.progress import Progress
 
 
 def simulated(

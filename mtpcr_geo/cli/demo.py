@@ -21,7 +21,7 @@ from mtpcr_geo.core.progress import NoProgress
 from mtpcr_geo.io.outputs import OutputSet
 
 if TYPE_CHECKING:
-    from mtpcr_geo.pipeline.stage import Progress
+    from mtpcr_geo.core.progress import Progress
     from mtpcr_geo.registration import Registration
 
 GROUND, AERIAL, TRUTH, RESULT = "ground.laz", "aerial.laz", "truth.json", "result"

@@ -14,8 +14,8 @@ from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.suggestions import meant, suggestions
 
 if TYPE_CHECKING:
+    from mtpcr_geo.core.progress import Progress
     from mtpcr_geo.pipeline.runner import RunResult
-    from mtpcr_geo.pipeline.stage import Progress
 
 
 def run(options: PipelineVerb) -> None:

@@ -15,8 +15,8 @@ from mtpcr_geo.cli.parameters import switch
 from mtpcr_geo.core.errors import EXIT_DOUBTFUL, EXIT_REFUSED, one_line
 
 if TYPE_CHECKING:
+    from mtpcr_geo.core.progress import Progress
     from mtpcr_geo.core.types import Verdict
-    from mtpcr_geo.pipeline.stage import Progress
 
 Quiet = Annotated[bool, switch(options.Quiet)]
 Overwrite = Annotated[bool, switch(options.Overwrite)]

@@ -184,7 +184,9 @@ def run_pipeline(pipeline: str, xyz: Floats, inverse: bool = False) -> Floats:
     from pyproj.exceptions import ProjError
 
     direction = TransformDirection.INVERSE if inverse else TransformDirection.FORWARD
-    x, y, z = (np.array(xyz[:, axis], np.float64) for axis in range(3))
+    # pyproj tries to take an array of one as a number, which numpy warns of; a list of one it does not
+    single = len(xyz) == 1
+    x, y, z = (list(axis) if single else np.array(axis, np.float64) for axis in xyz.T)
     try:
         moved = _transformer(pipeline).transform(x, y, z, direction=direction, errcheck=False)
     except ProjError as error:

@@ -8,7 +8,7 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
-import mtpcr_geo
+from mtpcr_geo.core.version import __version__
 
 _LIBRARIES = (
     "numpy", "scipy", "laspy", "lazrs", "rasterio", "pyproj", "opencv-python-headless", "small-gicp",
@@ -18,7 +18,7 @@ _LIBRARIES = (
 
 def versions() -> dict[str, str]:
     """Return the version of this package, of Python and of the libraries that are installed."""
-    found = {"mtpcr_geo": mtpcr_geo.__version__, "python": platform.python_version()}
+    found = {"mtpcr_geo": __version__, "python": platform.python_version()}
     for name in _LIBRARIES:
         try:
             found[name] = metadata.version(name)

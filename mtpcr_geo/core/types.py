@@ -13,13 +13,20 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import ComparesArrays, Grey, Mask
 from mtpcr_geo.core.arrays import Floats as Floats
 from mtpcr_geo.core.cloud import Cloud
+from mtpcr_geo.core.fits import GroundFit as GroundFit
+from mtpcr_geo.core.fits import IcpMethod as IcpMethod
+from mtpcr_geo.core.fits import IcpResult as IcpResult
+from mtpcr_geo.core.fits import IcpRound as IcpRound
+from mtpcr_geo.core.fits import IcpTrial as IcpTrial
+from mtpcr_geo.core.fits import Refinement as Refinement
+from mtpcr_geo.core.fits import Solution as Solution
+from mtpcr_geo.core.fits import SolveSettings as SolveSettings
 from mtpcr_geo.core.grid import Grid
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.frames import FrameLink, WorkFrame
 
 VerdictName = Literal["accepted", "doubtful", "refused"]
-IcpMethod = Literal["gicp", "point_to_plane", "point_to_point"]
 LevellingMethod = Literal["none", "plane", "verticals"]
 Look = Literal["band_pass", "paper", "paper_normalised", "grey", "grey_printed"]
 """How the image of a raster is made that keypoint matchers see, see `mtpcr_geo.method.images.image_of`."""
@@ -210,204 +217,6 @@ class TiePoints(ComparesArrays):
 
     def __len__(self) -> int:
         return len(self.score)
-
-
-@dataclass(frozen=True)
-class SolveSettings:
-    """How a transform is solved from tie points.
-
-    Attributes:
-        robust_start: begin from the yaw and shift that RANSAC finds; else from all tie points, as in the
-            paper.
-        upright: solve yaw and shift, trusting the levelling; else all six degrees of freedom.
-        tries: pairs of tie points that RANSAC tries.
-        seed: of RANSAC.
-
-    """
-
-    robust_start: bool = True
-    upright: bool = True
-    tries: int = 2000
-    seed: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Solution(ComparesArrays):
-    """Result of the iterative SVD, in levelled coordinates.
-
-    Attributes:
-        T: 4x4 from source to target.
-        inlier: (n,) tie points within the final threshold.
-        iterations: rounds until nothing changed.
-        threshold: final residual threshold, metres.
-        settings: how it was solved.
-        used: tie points it was solved from.
-
-    """
-
-    T: Floats
-    inlier: Mask
-    iterations: int
-    threshold: float
-    settings: SolveSettings = SolveSettings()
-    used: int = 0
-
-    def audit(self) -> dict[str, Any]:
-        """Return the figures of the solution, for the audit."""
-        return {
-            "used": self.used,
-            "inliers": int(self.inlier.sum()),
-            "iterations": self.iterations,
-            "threshold_m": self.threshold,
-            "yaw_deg": float(np.degrees(transforms.yaw_of(self.T[:3, :3]))),
-            "settings": {one.name: getattr(self.settings, one.name) for one in fields(self.settings)},
-        }
-
-
-@dataclass(frozen=True, eq=False)
-class GroundFit(ComparesArrays):
-    """Height, and tilt where wanted, settled on the ground that both clouds see.
-
-    Attributes:
-        T: 4x4 from source to target, work coordinates.
-        cells: cells where both see the ground.
-        agreeing: of these, cells that agree with the fit.
-        rise_m: metres by which the source was raised; None where too little ground is seen.
-        spread_m: robust spread of the agreeing cells' height differences, metres.
-        tilt_deg: angle by which the source was tilted, degrees.
-        followed: whether the transform was taken over.
-
-    """
-
-    T: Floats
-    cells: int
-    agreeing: int = 0
-    rise_m: float | None = None
-    spread_m: float | None = None
-    tilt_deg: float = 0.0
-    followed: bool = True
-
-    def audit(self) -> dict[str, Any]:
-        """Return the figures of the fit, for the audit."""
-        if self.rise_m is None:
-            return {"ground_cells": self.cells, "followed": self.followed}
-        return {
-            "ground_cells": self.cells,
-            "ground_cells_agreeing": self.agreeing,
-            "rise_m": self.rise_m,
-            "ground_spread_m": self.spread_m,
-            "tilt_deg": self.tilt_deg,
-            "followed": self.followed,
-        }
-
-
-@dataclass(frozen=True)
-class IcpRound:
-    """One round of ICP.
-
-    Attributes:
-        max_correspondence_distance_m: farthest correspondence, metres.
-        iterations: iterations done.
-        inliers: points with a correspondence at the end.
-        converged: whether it stood still.
-
-    """
-
-    max_correspondence_distance_m: float
-    iterations: int
-    inliers: int
-    converged: bool
-
-
-@dataclass(frozen=True)
-class IcpTrial:
-    """How well one candidate of the refinement fits.
-
-    Attributes:
-        surface_residual: how badly flat surfaces meet: 0 all meet, 1 none does.
-        tie_points: tie points that agree with it in plan.
-
-    """
-
-    surface_residual: float
-    tie_points: int
-
-
-@dataclass(frozen=True, eq=False)
-class IcpResult(ComparesArrays):
-    """What ICP came to, and which of its runs was followed.
-
-    Attributes:
-        T: 4x4 from source to target, work coordinates.
-        method: ICP variant.
-        voxel_m: thinning, metres.
-        points_source, points_target: points kept of each cloud.
-        tried: the candidates by name: starts and runs of ICP.
-        chosen: name of the candidate taken.
-        followed: whether it is a run of ICP.
-        lost_tie_points: whether a run whose surfaces met better was not followed, since it lost tie points.
-        rounds: rounds of the run that was followed.
-        rotated_deg: angle by which it turned the start, degrees; None where none was followed.
-
-    """
-
-    T: Floats
-    method: IcpMethod
-    voxel_m: float
-    points_source: int
-    points_target: int
-    tried: Mapping[str, IcpTrial]
-    chosen: str
-    followed: bool
-    lost_tie_points: bool
-    rounds: tuple[IcpRound, ...] = ()
-    rotated_deg: float | None = None
-
-    def audit(self) -> dict[str, Any]:
-        """Return the figures of the runs, for the audit."""
-        rounds: dict[str, Any] = {}
-        if self.rotated_deg is not None:
-            rounds = {"rounds": [vars(one) for one in self.rounds], "rotated_deg": self.rotated_deg}
-        return {
-            "method": self.method,
-            "voxel_m": self.voxel_m,
-            "points_source": self.points_source,
-            "points_target": self.points_target,
-            "tried": {name: vars(trial) for name, trial in self.tried.items()},
-            "chosen": self.chosen,
-            "followed": self.followed,
-            "lost_tie_points": self.lost_tie_points,
-            **rounds,
-        }
-
-
-@dataclass(frozen=True, eq=False)
-class Refinement(ComparesArrays):
-    """Result of the refinement.
-
-    Attributes:
-        T: 4x4 from source to target, work coordinates.
-        T_before: the same before the refinement.
-        ground_before: height and tilt settled before ICP, where that was asked for.
-        icp: what ICP came to, where it ran.
-        ground_after: height settled after ICP, where that was asked for.
-
-    """
-
-    T: Floats
-    T_before: Floats
-    ground_before: GroundFit | None = None
-    icp: IcpResult | None = None
-    ground_after: GroundFit | None = None
-
-    def audit(self) -> dict[str, Any]:
-        """Return what each step did, for the audit."""
-        steps: dict[str, GroundFit | IcpResult | None] = {
-            "ground_before": self.ground_before,
-            "icp": self.icp,
-            "ground_after": self.ground_after,
-        }
-        return {name: step.audit() for name, step in steps.items() if step is not None}
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo import __version__
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats, Image, Mask
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Pair, Side
+from mtpcr_geo.core.version import __version__
 from mtpcr_geo.crs import WorkFrame
 from mtpcr_geo.export import overviews
 

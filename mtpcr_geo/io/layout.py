@@ -12,10 +12,10 @@ import numpy as np
 from laspy.vlrs.known import ExtraBytesStruct, ExtraBytesVlr
 from numpy.typing import NDArray
 
-import mtpcr_geo
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud, PointTable, flags_of_table
 from mtpcr_geo.core.errors import InputError
+from mtpcr_geo.core.version import __version__
 from mtpcr_geo.io.dimensions import LEGACY_OVERLAP, PDAL_NAMES, SCAN_ANGLE_STEP
 from mtpcr_geo.io.las import LasCloud, xyz_of
 from mtpcr_geo.io.vlr import EXTRA_BYTES, WKT_RECORD, Record
@@ -66,7 +66,7 @@ def layout(cloud: Cloud, crs: CRS | None) -> tuple[laspy.LasHeader, Iterator[Chu
         header, chunks = _table_layout(cloud)
     header.global_encoding.wkt = True
     header.system_identifier = "TRANSFORMATION"
-    header.generating_software = f"mtpcr_geo {mtpcr_geo.__version__}"
+    header.generating_software = f"mtpcr_geo {__version__}"
     header.creation_date = date.today()
     if crs is not None:
         wkt = wkt_of(crs).encode() + b"\0"

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import InputError, OptionError
+from mtpcr_geo.core.progress import Progress
 from mtpcr_geo.io.memory import cloud_of
 from mtpcr_geo.pipeline import grammar
 from mtpcr_geo.pipeline.runner import RunResult, Settings, execute, validate
-from mtpcr_geo.pipeline.stage import Progress, Value
+from mtpcr_geo.pipeline.stage import Value
 from mtpcr_geo.pipeline.stages.memory import MemoryReader
 
 if TYPE_CHECKING:

@@ -10,14 +10,14 @@ from pathlib import Path
 
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError, RegistrationError
-from mtpcr_geo.core.progress import NoProgress
+from mtpcr_geo.core.progress import NoProgress, Progress
 from mtpcr_geo.core.system import versions
 from mtpcr_geo.core.types import Pair, Verdict
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.pipeline.grammar import StageSpec
 from mtpcr_geo.pipeline.plan import plan
 from mtpcr_geo.pipeline.records import RunFacts, StageRecord, input_files
-from mtpcr_geo.pipeline.stage import Node, Progress, RunContext, Stage, Value
+from mtpcr_geo.pipeline.stage import Node, RunContext, Stage, Value
 
 
 @dataclass(frozen=True)

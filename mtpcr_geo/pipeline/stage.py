@@ -5,15 +5,15 @@ from __future__ import annotations
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict
 
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.progress import Progress as Progress
 from mtpcr_geo.core.recorder import NullRecorder, Recorder
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.io.outputs import OutputSet
@@ -29,13 +29,6 @@ class StageOptions(BaseModel):
 
 
 OptionsModel = type[StageOptions]
-
-
-class Progress(Protocol):
-    """Where long work reports how far it is."""
-
-    def task(self, what: str, total: int | None = None) -> AbstractContextManager[Any]:
-        """Open a task; the context gives a callable `advance(n)`."""
 
 
 @dataclass

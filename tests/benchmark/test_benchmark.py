@@ -153,7 +153,7 @@ def test_method_or_option_that_is_not_there_is_named(spec, message):
 
 
 def test_missing_library_is_said(monkeypatch):
-    monkeypatch.setattr(methods.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(MissingPartError, match="kiss_matcher"):
         methods.make_method("kiss-matcher")
 
@@ -237,6 +237,7 @@ def test_external_command_gives_its_transform(tmp_path, form):
     xyz = np.random.default_rng(0).normal(size=(50, 3)).round(6)
     answer = external_method(tmp_path, "work", format=form).estimate(xyz, xyz + [1.0, 2.0, 3.0], seed=0)
     assert answer.reason == ""
+    assert answer.T_target_source is not None
     assert np.allclose(answer.T_target_source, transforms.translation((1.0, 2.0, 3.0)), atol=1e-6)
 
 

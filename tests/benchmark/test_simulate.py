@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+from typing import Any
 
 import laspy
 import numpy as np
@@ -22,7 +23,13 @@ from mtpcr_geo.benchmark.simulator.vegetation import Plants, Species
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import MissingPartError, OptionError, OutputError
 
-SMALL = {"extent_m": 160.0, "overlap": 0.25, "ground_beams": 150_000, "air_density": 3.0, "voxel_m": 0.2}
+SMALL: dict[str, Any] = {
+    "extent_m": 160.0,
+    "overlap": 0.25,
+    "ground_beams": 150_000,
+    "air_density": 3.0,
+    "voxel_m": 0.2,
+}
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +44,10 @@ def sheet(z: float, material: int, half: float = 50.0) -> np.ndarray:
 def plumb_beams(xy: np.ndarray, z: float) -> instruments.Beams:
     n = len(xy)
     return instruments.Beams(
-        np.c_[xy, np.full(n, z)], np.tile([0.0, 0.0, -1.0], (n, 1)), np.arange(n) * 1.0, np.zeros((n, 3))
+        np.c_[xy, np.full(n, z)],
+        np.tile([0.0, 0.0, -1.0], (n, 1)),
+        np.arange(n, dtype=np.float64),
+        np.zeros((n, 3)),
     )
 
 
@@ -261,7 +271,7 @@ def test_block_meets_both_shares():
     x, y = np.meshgrid(np.arange(-150, 60), np.arange(-30, 30))
     cells = np.stack([x.ravel(), y.ravel()], 1)
     block, gap = place_block(cells, 150.0, 0.0, 0.2, 0.2)
-    inside = block.contains(cells + 0.5).sum()
+    inside = block.contains((cells + 0.5).astype(np.float64)).sum()
     assert gap < 0.05
     assert inside / len(cells) == pytest.approx(0.2, abs=0.03)
     assert inside / block.area == pytest.approx(0.2, abs=0.05)

@@ -88,14 +88,19 @@ def test_sound_clouds_have_no_findings(good):
     report = check_clouds(*good)
     assert report.findings == ()
     assert report.goes_on
-    assert report.relation.name == "overlapping"
-    assert report.relation.source_share > 0.95
-    assert 0.65 < report.relation.target_share < 0.85
+    relation = report.relation
+    assert relation is not None
+    assert relation.name == "overlapping"
+    assert relation.source_share is not None
+    assert relation.source_share > 0.95
+    assert relation.target_share is not None
+    assert 0.65 < relation.target_share < 0.85
     facts = report.clouds["target"]
     assert facts.crs_code == "EPSG:25832"
     assert facts.horizontal_unit == facts.vertical_unit == "metre"
     assert facts.points == 20_000
     assert facts.density_per_m2 == pytest.approx(20_000 / (200 * 160), rel=0.15)
+    assert facts.extent_m is not None
     assert facts.extent_m[:2] == pytest.approx([200, 160], abs=0.1)
     assert list(report.clouds) == ["source", "target"]
 
@@ -388,6 +393,8 @@ def test_large_clouds_are_judged_by_a_sample(pairs, monkeypatch):
     assert codes(report, "warning") == ["same-points"]
     share = int(only(report, "same-points").what.split()[1].rstrip("%"))
     assert 70 <= share <= 100  # the crop was rounded to a coarser scale, where halves go either way
+    assert report.relation is not None
+    assert report.relation.source_share is not None
     assert report.relation.source_share > 0.9
     assert report.clouds["target"].maximum == check_clouds(pairs["target"]).clouds["source"].maximum
     assert codes(check_clouds(pairs["source"], pairs["target"]), "warning") == []
@@ -527,4 +534,5 @@ def test_real_pairs_are_sound(name, words, shared_data):
     report = check_clouds(folder / "source.laz", folder / "target.laz", **words)
     assert report.goes_on
     assert codes(report, "error") == codes(report, "warning") == []
+    assert report.relation is not None
     assert report.relation.name == "overlapping"

@@ -11,7 +11,7 @@ angles = st.floats(-np.pi, np.pi)
 
 
 @given(angles, angles, st.floats(-0.5, 0.5))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_inverse_undoes_a_transform(yaw: float, azimuth: float, tilt: float) -> None:
     T = transforms.compose(
         transforms.yaw_matrix(yaw) @ transforms.tilt_matrix(azimuth, tilt), np.array([3.0, -7.0, 2.0])

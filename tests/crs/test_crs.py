@@ -152,7 +152,7 @@ def test_bounds_that_make_no_sense():
 SHIFTED_COORDINATE = st.integers(-100_000, 100_000)
 
 
-@settings(deadline=None, derandomize=True, max_examples=50)
+@settings(max_examples=50)
 @given(
     steps=st.lists(st.tuples(*[SHIFTED_COORDINATE] * 3), min_size=2, max_size=20),
     shift=st.sampled_from([5_000_000.0, -5_000_000.0, 1_000_000.0]),
@@ -166,7 +166,7 @@ def test_a_far_shift_changes_no_work_coordinate(steps, shift):
     assert np.array_equal(links[0].to_work(near), links[1].to_work(near + shift))
 
 
-@settings(deadline=None, derandomize=True, max_examples=50)
+@settings(max_examples=50)
 @given(
     steps=st.lists(st.tuples(*[SHIFTED_COORDINATE] * 3), min_size=2, max_size=20),
     yaw=st.floats(-np.pi, np.pi),
@@ -446,6 +446,7 @@ def test_output_in_a_crs_of_choice(code, height):
     link = frame.output or target_link
     crs = CRS.from_user_input(code)
     out = link.to_file(target_link.to_work(site()))
+    assert link.file_crs is not None
     assert same_place(link.file_crs, crs)
     expected = moved_to(crs, site(), height=height)
     assert np.allclose(out, expected, rtol=0, atol=1e-8 if crs.is_geographic else 1e-6)

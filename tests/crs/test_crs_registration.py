@@ -58,7 +58,12 @@ def run(sides: Sides, source: Variant, target: Variant, folder: Path, **options:
         for role, side, xyz in zip(("source", "target"), (source, target), sides, strict=True)
     ]
     return register(
-        *files, folder / "out", recording=False, overwrite=True, **options_of(source, target), **options
+        files[0],
+        files[1],
+        folder / "out",
+        recording=False,
+        overwrite=True,
+        **{**options_of(source, target), **options},
     )
 
 
@@ -181,7 +186,7 @@ def test_a_far_shift_of_both_changes_no_whole_registration(small: Sides, tmp_pat
                 las[name] = np.rint(xyz[:, axis] * 100).astype(np.int32)
             files.append(tmp_path / f"{role}{k}.laz")
             las.write(files[-1])
-        result = register(*files, tmp_path / f"out{k}", local=True, level="none", recording=False)
+        result = register(files[0], files[1], tmp_path / f"out{k}", local=True, level="none", recording=False)
         assert result.pair is not None
         found.append(TransformChain.of(result.pair).forward(near[0] + far) - far)
     assert np.abs(found[0] - found[1]).max() < 1e-6
@@ -352,7 +357,8 @@ def test_an_engineering_crs_defines_no_vertical(town_files: tuple[Path, Path], t
 
 
 def test_an_engineering_crs_is_no_prior(town_files: tuple[Path, Path], tmp_path: Path) -> None:
-    both = {"source_crs": SITE_GRID, "target_crs": SITE_GRID}
-    for crs in ({"source_crs": SITE_GRID}, {"target_crs": SITE_GRID}, both):
+    both: dict[str, Any] = {"source_crs": SITE_GRID, "target_crs": SITE_GRID}
+    one_sided: list[dict[str, Any]] = [{key: SITE_GRID} for key in both]
+    for crs in [*one_sided, both]:
         with pytest.raises(OptionError, match="needs a CRS on both"):
-            register(*town_files, tmp_path / "out", prior="georef", recording=False, **crs)
+            register(town_files[0], town_files[1], tmp_path / "out", prior="georef", recording=False, **crs)

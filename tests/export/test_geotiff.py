@@ -188,6 +188,7 @@ def test_ties_open_in_gdal_where_they_belong(tmp_path):
     table = dict(zip(info["fields"], fields, strict=True))
     assert info["crs"] == "EPSG:25833"
     xyz = np.array([struct.unpack("<BI3d", shape)[2:] for shape in shapes])
+    assert pair.tie_points is not None
     assert np.allclose(xyz, pair.tie_points.target + ORIGIN)
     assert table["held_out"].sum() == 16
     assert table["inlier"].dtype == bool

@@ -71,6 +71,7 @@ def test_one_whole_file_without_a_network(tmp_path, verdict):
     assert all(source.startswith("data:image/jpeg;base64,") for source in parser.fetched)
     for source in parser.fetched:
         picture = cv2.imdecode(np.frombuffer(base64.b64decode(source.split(",")[1]), np.uint8), 1)
+        assert picture is not None
         assert picture.std() > 5.0
     assert f'class="verdict {verdict}"' in html
     assert "http" not in html
@@ -86,13 +87,16 @@ def test_it_tells_what_where_and_how_sure(tmp_path):
     ):  # fmt: skip
         assert text in html
     assert "some/where" not in html
-    numbers = re.search(r"<pre>(.*?)</pre>", html, re.DOTALL).group(1).split()
+    (printed,) = re.findall(r"<pre>(.*?)</pre>", html, re.DOTALL)[:1]
+    numbers = printed.split()
     assert np.array_equal(np.array(numbers, float).reshape(4, 4), TransformChain.of(pair).T_file)
 
 
 def test_the_worked_example_agrees_with_the_matrix():
     pair = make_pair(1000)
-    before, after = descriptions.worked_example(pair)
+    example = descriptions.worked_example(pair)
+    assert example is not None
+    before, after = example
     assert np.allclose((TransformChain.of(pair).T_file @ [*before, 1.0])[:3], after, atol=1e-6)
 
 
@@ -148,6 +152,9 @@ def test_lines_end_at_the_pixels_that_match():
     pair = make_pair(2000, state="matched")
     picture, ends, _, kind = drawing.match_lines(pair, gap=10)
     source, target = pair.source.bev, pair.target.bev
+    assert source is not None
+    assert target is not None
+    assert pair.matches is not None
     assert picture.shape[1] == source.grid.width + 10 + target.grid.width
     below = (picture.shape[0] - source.grid.height) // 2
     assert np.allclose(ends[:, 0], pair.matches.source_px + np.array([0, below]))
@@ -188,9 +195,13 @@ def test_empty_rasters_can_be_drawn():
 def test_thinned_lines_still_end_at_what_they_mean():
     pair = make_pair(2000, state="matched")
     picture, ends, _, _ = drawing.match_lines(pair, gap=0, max_side=50)
-    assert max(drawing.thinned(pair.source.bev, 50)[0].shape) <= 50
-    step = drawing.thinned(pair.target.bev, 50)[2]
-    left = picture.shape[1] - -(-pair.target.bev.grid.width // step)
+    source, target = pair.source.bev, pair.target.bev
+    assert source is not None
+    assert target is not None
+    assert pair.matches is not None
+    assert max(drawing.thinned(source, 50)[0].shape) <= 50
+    step = drawing.thinned(target, 50)[2]
+    left = picture.shape[1] - -(-target.grid.width // step)
     assert np.allclose((ends[:, 1, 0] - left) * step, pair.matches.target_px[:, 0])
 
 

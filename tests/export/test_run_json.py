@@ -58,14 +58,15 @@ def found_keys(
     town_files: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, set[str]]:
     found = {}
-    for name, options in {
+    runs: dict[str, dict[str, Any]] = {
         "correlation": {"source_crs": "local"},
         "prior": {"prior": "georef"},
         "keypoints": {"profile": "paper", "matcher": "orb"},
         "failed": {"matcher": "orb", "cell": 30.0},
-    }.items():
+    }
+    for name, options in runs.items():
         out = tmp_path_factory.mktemp(name) / "out"
-        register(*town_files, out, recording=False, **options)
+        register(town_files[0], town_files[1], out, recording=False, **options)
         found[name] = keys_of(json.loads((out / "run.json").read_text()))
     return found
 

@@ -10,6 +10,7 @@ import pytest
 from conftest import REPOSITORY
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from pyproj import CRS
 
 from mtpcr_geo.core.errors import InputError, MtpcrError, OutputError
@@ -232,7 +233,7 @@ def test_classes_above_31_are_classes(tmp_path):
 @pytest.mark.parametrize("name", ["Withheld", "ClassFlags"])
 def test_flags_are_read_from_their_own_dimensions(tmp_path, name):
     flags = np.where(np.arange(300) < 20, 1 if name == "Withheld" else 4, 0).astype(np.uint8)
-    extra = {"Classification": np.full(300, 200, np.uint8), name: flags}
+    extra: dict[str, NDArray[np.generic]] = {"Classification": np.full(300, 200, np.uint8), name: flags}
     cloud = ArrayCloud(random_xyz(300), UTM, extra=extra)
     assert scan(cloud).dropped == 20
     write_cloud(tmp_path / "out.las", cloud, None, UTM)
@@ -250,7 +251,8 @@ def test_a_class_that_las_cannot_hold_is_refused(tmp_path):
 
 
 def test_flags_of_older_pdal_are_separated_by_who_knows_the_file():
-    table = {"X": np.zeros(4), "Classification": np.array([5, 2 | 128, 12 | 32, 6 | 64], np.uint8)}
+    raw = [5, 2 | 128, 12 | 32, 6 | 64]
+    table: dict[str, NDArray[np.generic]] = {"X": np.zeros(4), "Classification": np.array(raw, np.uint8)}
     separate = separate_legacy_flags(table)
     assert separate["Classification"].tolist() == [5, 2, 12, 6]
     assert separate["Withheld"].tolist() == [0, 1, 0, 0]
@@ -277,6 +279,7 @@ def test_crs_is_read_from_wkt_and_geotiff_keys(tmp_path, geokeys):
     version, point_format = ("1.2", 1) if geokeys else ("1.4", 6)
     write_las(tmp_path / "in.las", point_format=point_format, version=version, crs=UTM)
     cloud = open_cloud(tmp_path / "in.las")
+    assert cloud.crs is not None
     assert cloud.crs.to_epsg() == 25832
 
 
@@ -300,7 +303,9 @@ def test_geotiff_keys_alone(tmp_path, keys, name):
     las = write_las(path, point_format=1, version="1.2")
     las.header.vlrs.append(laspy.VLR("LASF_Projection", 34735, "keys", geokey_record(keys)))
     las.write(path)
-    assert name in open_cloud(path).crs.name
+    crs = open_cloud(path).crs
+    assert crs is not None
+    assert name in crs.name
 
 
 def test_crs_that_cannot_be_read_is_a_note(tmp_path):
@@ -430,7 +435,7 @@ class Chunked(ArrayCloud):
         return super().table_chunks(self.size)
 
 
-@settings(deadline=None, derandomize=True, max_examples=30)
+@settings(max_examples=30)
 @given(
     n=st.integers(150, 3000),
     budget=st.integers(100, 2000),
@@ -496,7 +501,9 @@ def test_copc_is_a_real_octree(tmp_path):
         inside = np.sum(np.all(xyz[:, :2] <= box.maxs, axis=1))
         assert abs(len(reader.query(box)) - inside) <= 5
     assert len(all_xyz(open_cloud(path))) == n
-    assert open_cloud(path).crs.to_epsg() == 25832
+    crs = open_cloud(path).crs
+    assert crs is not None
+    assert crs.to_epsg() == 25832
     copclib = pytest.importorskip("copclib", reason="copclib is not installed")
     assert copclib.FileReader(str(path)).copc_config.las_header.point_count == n
 
@@ -553,7 +560,7 @@ def test_waveforms_of_mixed_channels_are_not_compressed(tmp_path):
     assert np.array_equal(after.wavepacket_offset, las.wavepacket_offset)
 
 
-@settings(deadline=None, derandomize=True, max_examples=25)
+@settings(max_examples=25)
 @given(data=st.data())
 def test_scrambled_files_never_raise_anything_else(data, tmp_path_factory):
     path = tmp_path_factory.mktemp("scrambled") / "in.laz"

@@ -16,7 +16,7 @@ from mtpcr_geo.cli.app import app
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import InputError, MissingPartError, MtpcrError, OptionError, RegistrationError
 from mtpcr_geo.core.grid import Grid
-from mtpcr_geo.core.types import Bev, Matches, TiePoints
+from mtpcr_geo.core.types import Bev, Look, Matches, TiePoints
 from mtpcr_geo.match.base import Features, PixelMatches, View, margin_of, one_to_one
 from mtpcr_geo.match.correlation import CorrelationSettings
 from mtpcr_geo.match.descriptors import NearestNeighbours, Orb, RootSift
@@ -54,8 +54,9 @@ def small_models(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def views(pair, look: str = "band_pass") -> tuple[View, View]:
-    return tuple(View(side.bev, image_of(side.bev, look)) for side in (pair.source, pair.target))
+def views(pair, look: Look = "band_pass") -> tuple[View, View]:
+    source, target = (View(side.bev, image_of(side.bev, look)) for side in (pair.source, pair.target))
+    return source, target
 
 
 def quarter_turned(cell: float = 0.5) -> tuple[View, View]:
@@ -66,9 +67,8 @@ def quarter_turned(cell: float = 0.5) -> tuple[View, View]:
     back = transforms.compose(transforms.yaw_matrix(-np.pi / 2), np.zeros(3))
     target = town(rng, 200_000)
     source = transforms.apply(back, target)
-    return tuple(
-        View(bev, image_of(bev, "band_pass")) for bev in (rasterise(source, cell), rasterise(target, cell))
-    )
+    turned, still = (rasterise(xyz, cell) for xyz in (source, target))
+    return View(turned, image_of(turned, "band_pass")), View(still, image_of(still, "band_pass"))
 
 
 def settings(folder: Path | None = None, **changes) -> KeypointSettings:
@@ -240,6 +240,7 @@ def test_superpoint_and_lightglue_of_random_weights_run_the_whole_path(town_file
     # random projections of patches tell places apart: the yaw is found, and not by ICP alone
     assert match["turn_deg"] == 90.0
     assert max(match["turn_agreeing"]) > 10
+    assert result.T_target_source is not None
     assert np.degrees(transforms.yaw_of(result.T_target_source[:3, :3])) == pytest.approx(90.0, abs=0.5)
     from rerun.chunk import RrdReader
 
@@ -254,7 +255,12 @@ def test_superpoint_and_lightglue_of_random_weights_run_the_whole_path(town_file
 
 def test_paper_profile_runs_the_whole_path(town_files, small_models, tmp_path):
     result = register(
-        *town_files, tmp_path / "out", profile="paper", matcher="superpoint", models=small_models
+        town_files[0],
+        town_files[1],
+        tmp_path / "out",
+        profile="paper",
+        matcher="superpoint",
+        models=small_models,
     )
     types = [record.type for record in result.report]
     steps = ["mtpcr.enhance", "mtpcr.match", "mtpcr.focus", "mtpcr.inverse_mapping"]
@@ -269,6 +275,7 @@ def test_fused_graph_finds_the_yaw(small_models):
 
 def test_fused_graph_shrinks_large_images(small_models):
     image = make_pair(60_000, state="levelled", cell=0.5).target.bev
+    assert image is not None
     shown = image_of(image, "band_pass")
     small = matcher("superpoint_lightglue_fused", small_models).images
     object.__setattr__(small, "model", small.model.model_copy(update={"tile": 160}))
@@ -281,7 +288,9 @@ def test_fused_graph_shrinks_large_images(small_models):
 def test_tiled_extraction_finds_what_the_whole_image_shows(small_models):
     from helpers_onnx import DIM
 
-    image = image_of(make_pair(120_000, state="levelled", cell=0.25).target.bev, "band_pass")
+    bev = make_pair(120_000, state="levelled", cell=0.25).target.bev
+    assert bev is not None
+    image = image_of(bev, "band_pass")
     model = ExtractorFile(file="superpoint.onnx", size_multiple=8, score_threshold=0.0005, descriptor_dim=DIM)
     path = small_models / "superpoint.onnx"
     whole, tiled = (
@@ -302,11 +311,11 @@ def test_focus_matches_again_where_overlap_is_small():
     def again(source: Bev, target: Bev, yaw: float | None) -> Matches:
         return own.match(*(View(bev, image_of(bev, "band_pass")) for bev in (source, target)), yaw=yaw)
 
-    kept = focus(again, first, *subjects, FocusSettings(theta=0.5))
+    kept = focus(again, first, subjects[0], subjects[1], FocusSettings(theta=0.5))
     assert kept.report["focus"]["overlap"] == pytest.approx(0.8, abs=0.05)
     assert not kept.report["focus"]["applied"]
     np.testing.assert_array_equal(kept.source_px, first.source_px)
-    forced = focus(again, first, *subjects, FocusSettings(theta=1.0, finer=1.5, radius_m=40.0))
+    forced = focus(again, first, subjects[0], subjects[1], FocusSettings(theta=1.0, finer=1.5, radius_m=40.0))
     reported = forced.report["focus"]
     assert reported["applied"]
     assert reported["agreeing_after"] > reported["agreeing_before"]
@@ -318,6 +327,8 @@ def test_focus_matches_again_where_overlap_is_small():
     log_focus(pen, pair.with_(matches=forced))
     assert logged == ["focus/before/image", "focus/before/lines", "focus/after/image", "focus/after/lines"]
     # still on the pixels of the rasters given
+    assert pair.source.bev is not None
+    assert pair.target.bev is not None
     s = pair.source.bev.grid.to_metres(forced.source_px)
     t = pair.target.bev.grid.to_metres(forced.target_px)
     T = transforms.compose(
@@ -330,11 +341,16 @@ def test_focus_matches_again_where_overlap_is_small():
 def test_focus_goes_round_correlation_too():
     pair = make_pair(60_000, state="levelled")
     own = matcher("correlation")
-    both = [View(side.bev) for side in (pair.source, pair.target)]
-    first = own.match(*both)
+    assert pair.source.bev is not None
+    assert pair.target.bev is not None
+    first = own.match(View(pair.source.bev), View(pair.target.bev))
     subjects = subjects_of(pair)
     again = focus(
-        lambda s, t, yaw: own.match(View(s), View(t), yaw=yaw), first, *subjects, FocusSettings(theta=1.0)
+        lambda s, t, yaw: own.match(View(s), View(t), yaw=yaw),
+        first,
+        subjects[0],
+        subjects[1],
+        FocusSettings(theta=1.0),
     )
     assert again.report["focus"]["cells_m"] == [0.5, 0.5]
 
@@ -460,18 +476,21 @@ def test_unknown_matcher_names_the_nearest():
 
 
 def test_options_of_the_other_kind_are_refused(town_files, tmp_path):
+    from mtpcr_geo.core.progress import NoProgress
+    from mtpcr_geo.io.outputs import OutputSet
     from mtpcr_geo.pipeline.registry import make_options, stage_types
+    from mtpcr_geo.pipeline.stage import RunContext
 
     kind = stage_types()["mtpcr.match"]
     for words, wrong in (({"method": "rootsift", "patch": 9}, "patch"), ({"turns": 4}, "turns")):
         stage = kind(make_options("match", kind.Options, words), "match")
         with pytest.raises(OptionError, match=f"option '{wrong}' is one of"):
-            stage.check(None)
+            stage.check(RunContext(OutputSet(), NoProgress()))
 
 
 def test_correlation_wants_one_cell_size(town_files, tmp_path):
     with pytest.raises(OptionError, match="one cell size"):
-        register(*town_files, tmp_path / "out", profile="paper", matcher="correlation")
+        register(town_files[0], town_files[1], tmp_path / "out", profile="paper", matcher="correlation")
 
 
 def test_not_a_graph(small_models, tmp_path):
@@ -495,6 +514,7 @@ def test_graph_with_other_names(small_models, tmp_path):
 
 def test_wrong_descriptor_length(small_models):
     model = ExtractorFile(file="superpoint.onnx", size_multiple=8, descriptor_dim=99)
+    assert model is not None
     extractor = OnnxExtractor(model, small_models / "superpoint.onnx", Running("cpu"))
     noise = np.random.default_rng(1).integers(0, 255, (64, 64)).astype(np.uint8)
     with pytest.raises(InputError, match="wanted are"):
@@ -574,7 +594,9 @@ def test_cuda_is_refused_where_it_is_not_offered(small_models):
 @pytest.mark.parametrize("extractor", [RootSift(), Orb()])
 def test_extractors_are_deterministic_and_empty_on_nothing(extractor):
     assert len(extractor.extract(np.full((64, 64), 9, np.uint8))) == 0
-    image = image_of(make_pair(20_000, state="levelled").target.bev, "band_pass")
+    bev = make_pair(20_000, state="levelled").target.bev
+    assert bev is not None
+    image = image_of(bev, "band_pass")
     first, second = extractor.extract(image), extractor.extract(image)
     np.testing.assert_array_equal(first.px, second.px)
     np.testing.assert_array_equal(first.descriptors, second.descriptors)
@@ -603,6 +625,7 @@ def test_learned_matchers_on_a_real_pair(name, shared_models, shared_data, tmp_p
         models=shared_models,
         recording=False,
     )
+    assert result.T_target_source is not None
     assert np.degrees(transforms.rotation_angle(result.T_target_source[:3, :3])) < 0.5
     # ALIKED finds the pose by few tie points in one corner: it may be doubted, and says why, but not refused
     assert result.verdict.name in ("accepted", "doubtful")
@@ -612,6 +635,7 @@ def test_learned_matchers_on_a_real_pair(name, shared_models, shared_data, tmp_p
 @pytest.mark.slow
 def test_aliked_takes_a_large_raster_in_tiles(shared_models):
     model = descriptions(None)["aliked"].extractor
+    assert model is not None
     extractor = OnnxExtractor(model, shared_models / model.file, Running("cpu", 2), tile=256)
     rng = np.random.default_rng(3)
     image = np.full((1100, 700), 127, np.uint8)

@@ -83,19 +83,19 @@ def test_eq2_scaled_coordinates_and_cells_are_the_same_thing():
         raster = eq12.Rasteriser(grid, "ceil")
         raster.add(xyz * factor)
         found.append(raster.finish().count)
-    np.testing.assert_array_equal(*found)
+    np.testing.assert_array_equal(found[0], found[1])
 
 
 def test_eq3_printed_and_corrected():
     # zmin 0, zmax 10: 2.5 m is 63.75, floored to 63; as printed everything below the top is 0
-    bev = bev_of([[0.0, 2.5], [10.0, np.nan]])
+    bev = bev_of(np.array([[0.0, 2.5], [10.0, np.nan]]))
     np.testing.assert_array_equal(images.grey(bev), [[0, 63], [255, 0]])
     np.testing.assert_array_equal(images.grey(bev, printed=True), [[0, 0], [255, 0]])
 
 
 def test_eq3_zmin_is_that_of_all_points():
     # the lowest point of the first cell lies at -10, below all tops: 0 m is then half way
-    bev = bev_of([[0.0, 10.0]])
+    bev = bev_of(np.array([[0.0, 10.0]]))
     bev.low[0, 0] = -10.0
     np.testing.assert_array_equal(images.grey(bev), [[127, 255]])
 

@@ -48,7 +48,7 @@ def test_icp_does_not_hang_on_its_start_or_on_round_off(clouds) -> None:
     assert np.linalg.norm(elsewhere - plain, axis=1).max() < 0.001
     rng = np.random.default_rng(5)
     noisy = [cloud + rng.normal(0.0, 1e-4, cloud.shape) for cloud in clouds]
-    again = transforms.apply(icp(*noisy, off_by(0.0, (1e-3, 0.0, 0.0))), corners)
+    again = transforms.apply(icp(noisy[0], noisy[1], off_by(0.0, (1e-3, 0.0, 0.0))), corners)
     assert np.linalg.norm(again - plain, axis=1).max() < 0.001
 
 
@@ -150,7 +150,7 @@ def test_crops_that_lead_icp_off_the_ground_are_seen_through() -> None:
 
 @pytest.mark.parametrize("keep_tie_points", [0.5, 0.0])
 def test_icp_that_loses_the_ties_is_followed_only_where_that_is_asked(clouds, keep_tie_points: float) -> None:
-    pair = level_pair(*clouds, "none")
+    pair = level_pair(clouds[0], clouds[1], "none")
     aside = off_by(0.0, (2.2, -1.2, 0.0))
     rng = np.random.default_rng(2)
     place = rng.uniform(-40, 40, (60, 3)) * [1, 1, 0]
@@ -163,6 +163,9 @@ def test_icp_that_loses_the_ties_is_followed_only_where_that_is_asked(clouds, ke
     step = {"type": "mtpcr.refine", "tag": "refine", "keep_tie_points": keep_tie_points}
     refined = follow(pair, [step]).pair
     followed = keep_tie_points == 0.0
+    assert refined.T_target_source is not None
+    assert refined.refinement is not None
+    assert refined.refinement.icp is not None
     assert refined.refinement.icp.followed is followed
     assert refined.refinement.icp.lost_tie_points is not followed
     assert tie_points_agreeing(refined, refined.T_target_source) == (0 if followed else 60)
@@ -174,6 +177,7 @@ def test_way_from_the_ties_is_measured_in_plan() -> None:
     # under a degree of tilt levelled heights are off by metres, and coming back from that is no fault
     pair = make_pair(3000, tilt=4.0)
     up = transforms.inverse(pair.target.T_level_work)[:3, :3] @ np.array([0.0, 0.0, 2.5])
+    assert pair.T_target_source is not None
     raised = pair.with_(
         refinement=Refinement(pair.T_target_source, transforms.translation(-up) @ pair.T_target_source)
     )

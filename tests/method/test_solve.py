@@ -14,7 +14,7 @@ from mtpcr_geo.method.solve import fit_rigid, fit_upright, iterative_svd, ransac
 
 
 @given(st.floats(-np.pi, np.pi), st.floats(-0.3, 0.3), st.integers(0, 100))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_rigid_transform_is_recovered_exactly(yaw: float, tilt: float, seed: int) -> None:
     source = np.random.default_rng(seed).uniform(-100, 100, (8, 3))
     T = transforms.compose(

@@ -11,6 +11,7 @@ from conftest import REPOSITORY
 
 import mtpcr_geo
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.pipeline import grammar
 from mtpcr_geo.pipeline.options import RegisterOptions
@@ -31,7 +32,7 @@ def files_below(folder: Path) -> list[Path]:
 @pytest.fixture(scope="module")
 def registered(town_files, tmp_path_factory):
     out = tmp_path_factory.mktemp("run") / "out"
-    return register(*town_files, out), out
+    return register(town_files[0], town_files[1], out), out
 
 
 def test_register_brings_the_source_home_and_leaves_everything(registered):
@@ -72,9 +73,10 @@ def test_registered_cloud_keeps_count_and_moves_every_point(registered, town_fil
 
 def test_dumped_pipeline_gives_the_same_bits(registered, town_files, tmp_path):
     result, out = registered
-    stages = build_pipeline(*town_files, tmp_path / "again", RegisterOptions())
+    stages = build_pipeline(town_files[0], town_files[1], tmp_path / "again", RegisterOptions())
     text = grammar.dump(stages)
     again = execute(grammar.link(grammar.parse(text)), Settings())
+    assert again.pair is not None
     assert TransformChain.of(again.pair).T_file.tobytes() == result.T_target_source.tobytes()
     for name in ("transform.cloudcompare.txt", "bev/source.tif", "registered.laz"):
         first, second = (out / name).read_bytes(), (tmp_path / "again" / name).read_bytes()
@@ -82,7 +84,7 @@ def test_dumped_pipeline_gives_the_same_bits(registered, town_files, tmp_path):
 
 
 def test_another_seed_is_in_the_dump(town_files, tmp_path):
-    stages = build_pipeline(*town_files, tmp_path, RegisterOptions(seed=5))
+    stages = build_pipeline(town_files[0], town_files[1], tmp_path, RegisterOptions(seed=5))
     assert {stage["type"] for stage in stages if stage.get("seed") == 5} >= {"mtpcr.level", "mtpcr.solve"}
 
 
@@ -94,7 +96,11 @@ def test_ready_pipelines_without_pdal(name, town_files, tmp_path, monkeypatch):
     pipeline = mtpcr_geo.Pipeline(ready(name), [f"--target.filename={target}", f"--source.filename={source}"])
     pipeline.validate()
     assert files_below(tmp_path) == []
-    assert pipeline.execute() == pipeline.stages["source"].count
+    count = pipeline.execute()
+    source_cloud = pipeline.stages["source"]
+    assert isinstance(source_cloud, Cloud)
+    assert count == source_cloud.count
+    assert pipeline.verdict is not None
     assert pipeline.verdict.name == "accepted"
     assert (tmp_path / "out" / "registered.laz").exists()
 
@@ -117,6 +123,7 @@ def test_composite_gives_what_its_steps_give(registered, town_files):
     source, target = town_files
     pipeline = mtpcr_geo.Pipeline([str(target), str(source), {"type": "mtpcr.register"}])
     pipeline.execute()
+    assert pipeline.pair is not None
     assert TransformChain.of(pipeline.pair).T_file.tobytes() == registered[0].T_target_source.tobytes()
 
 
@@ -137,11 +144,12 @@ def test_crop_count_and_arrays_without_pdal(town_files, monkeypatch):
 
 
 def test_refused_run_keeps_evidence_and_writes_no_result(town_files, tmp_path):
-    stages = build_pipeline(*town_files, tmp_path / "out", RegisterOptions(recording=False))
+    stages = build_pipeline(town_files[0], town_files[1], tmp_path / "out", RegisterOptions(recording=False))
     next(stage for stage in stages if stage["type"] == "mtpcr.assess")["neg_log10_p"] = 1e9
     next(stage for stage in stages if stage["type"] == "mtpcr.assess")["margin"] = 1e9
     result = execute(grammar.link(grammar.parse(grammar.dump(stages))))
     written = {path.name for path in files_below(tmp_path)}
+    assert result.verdict is not None
     if result.verdict.name == "refused":
         assert not written & {"registered.laz", "transform.json"}
     assert {"run.json", "ties.gpkg", "source.tif"} <= written
@@ -154,7 +162,7 @@ def test_registration_that_finds_nothing_is_refused_with_evidence(town_files, tm
         raise RegistrationError("no part of the source looks like the target")
 
     monkeypatch.setattr("mtpcr_geo.match.correlation.match", nothing)
-    result = register(*town_files, tmp_path / "out", recording=False)
+    result = register(town_files[0], town_files[1], tmp_path / "out", recording=False)
     assert result.verdict.name == "refused"
     assert "looks like" in result.verdict.reasons[0]
     written = {path.name for path in files_below(tmp_path)}
@@ -168,5 +176,5 @@ def test_interrupted_run_leaves_nothing(town_files, tmp_path, monkeypatch):
 
     monkeypatch.setattr("mtpcr_geo.verdict.decision.assess", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        register(*town_files, tmp_path / "out", recording=False)
+        register(town_files[0], town_files[1], tmp_path / "out", recording=False)
     assert not (tmp_path / "out").exists()

@@ -10,11 +10,11 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from mtpcr_geo import __version__
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.types import Pair, Side
+from mtpcr_geo.core.version import __version__
 from mtpcr_geo.export import descriptions, drawing
 from mtpcr_geo.export.recording import matching
 from mtpcr_geo.export.recording.layout import TIMELINE, Recorded, layout

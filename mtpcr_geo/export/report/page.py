@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from mtpcr_geo import __version__
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.types import Pair
+from mtpcr_geo.core.version import __version__
 from mtpcr_geo.crs import TransformChain
 from mtpcr_geo.export import charts, descriptions, drawing
 from mtpcr_geo.export.tie_points import footprints, tie_positions
