@@ -2,8 +2,8 @@
 
     python examples/benchmark_bev.py cloud.laz --cell 1 --runs 3
 
-Every run is a process of its own, start-up included; ours and PDAL's take turns. Ours makes highest z,
-lowest z and point count, PDAL's only the highest z.
+Every run is a process of its own, start-up included; the two programs take turns. mtpcr-geo makes highest z,
+lowest z and point count, PDAL only the highest z.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
-OURS = """
+MTPCR_GEO = """
 import sys, mtpcr_geo
 cloud, cell, out = sys.argv[1:]
 mtpcr_geo.Pipeline([
@@ -62,7 +62,7 @@ def main() -> None:
     found: dict[str, list[tuple[float, float]]] = {"mtpcr-geo": [], "PDAL": []}
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(chosen.runs):
-            for name, code in (("mtpcr-geo", OURS), ("PDAL", PDAL)):
+            for name, code in (("mtpcr-geo", MTPCR_GEO), ("PDAL", PDAL)):
                 found[name].append(measure(code, chosen.cloud, chosen.cell, Path(folder) / f"{name}.tif"))
     table = {
         name: {"best_s": min(t for t, _ in runs), "peak_mib": max(m for _, m in runs)}

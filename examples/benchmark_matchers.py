@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def key_of(row: dict[str, Any]) -> tuple[str, ...]:
-    """Give what tells one run from another."""
+    """Return what distinguishes one run from another."""
     return tuple(str(row[name]) for name in KEY)
 
 

@@ -131,15 +131,15 @@ def write_moved(source: laspy.LasData, xyz: np.ndarray, path: Path) -> None:
 
 
 def crs_options(folder: Path, pair: dict[str, Any]) -> list[str]:
-    """Say the CRS where a file does not: what pair.json tells of it."""
-    said = []
+    """Return the CRS options for files without one, from pair.json."""
+    options = []
     for role in ("source", "target"):
         with laspy.open(folder / f"{role}.laz") as file:
             if file.header.parse_crs() is None:
                 code = re.search(r"EPSG:\d+", pair["crs"])
                 local = f"{role} local" in pair["crs"] or code is None
-                said += [f"--{role}-crs", "local" if local else code[0]]
-    return said
+                options += [f"--{role}-crs", "local" if local else code[0]]
+    return options
 
 
 def run(source: Path, target: Path, options: list[str], out: Path) -> dict[str, Any]:

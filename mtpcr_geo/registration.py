@@ -1,103 +1,348 @@
-"""The whole registration: two files in, a registered cloud and its evidence out.
+"""The whole registration: two clouds in, a registered cloud and its evidence out.
 
-`build_pipeline` names the steps; the same engine runs them that runs any pipeline JSON.
+`register` makes the stages and runs them; `build_pipeline` names the same stages as pipeline JSON.
 """
 
 from __future__ import annotations
 
+import math
+import os
+import shutil
+import tempfile
+import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import cached_property
+from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast, overload
 
+import numpy as np
 from pydantic import ValidationError
 
-from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.cloud import ArrayCloud, Cloud
+from mtpcr_geo.core.errors import InputError, MissingPartError, OptionError, RegistrationError
 from mtpcr_geo.core.progress import Progress
 from mtpcr_geo.core.types import Floats, Pair, Verdict
 from mtpcr_geo.crs.chain import TransformChain
-from mtpcr_geo.pipeline import grammar
-from mtpcr_geo.pipeline.options import OUTPUT_NAMES, RegisterOptions
-from mtpcr_geo.pipeline.registry import first_problem
-from mtpcr_geo.pipeline.runner import RunResult, Settings, execute
-from mtpcr_geo.pipeline.steps import steps_of, without_defaults
+from mtpcr_geo.export.apply import move, moved_by, write_moved
+from mtpcr_geo.io.memory import cloud_of, is_array
+from mtpcr_geo.pipeline.options import OUTPUT_NAMES, RegisterOptions, first_problem
+from mtpcr_geo.pipeline.records import StageRecord
+from mtpcr_geo.pipeline.runner import RunResult, run
+from mtpcr_geo.pipeline.stage import Stage, chained
+from mtpcr_geo.pipeline.stages.memory import MemoryReader
+from mtpcr_geo.pipeline.steps import reader_of, recording_writer, steps_of, writers_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
+
+    from mtpcr_geo.io.memory import CloudLike
 
 
-@dataclass(frozen=True)
 class Registration:
     """What a registration came to.
 
     Attributes:
         verdict: accepted, doubtful or refused, with reasons and metrics.
-        T_target_source: 4x4 on the coordinates as they stand in the files, source to target; None where
-            no transform was found. It stands here even when refused: look at the verdict.
         pair: the whole state, from levelled clouds to tie points; None where not even a pair was made.
+        report: the finished stages, with their options, metadata and seconds.
         outputs: the files written, by what they are.
-        report: what each stage noted, with its time.
+        force: whether a refused result may be used.
 
     """
 
-    verdict: Verdict
-    T_target_source: Floats | None
-    pair: Pair | None
-    outputs: dict[str, Path]
-    report: Sequence[Any]
+    def __init__(
+        self,
+        result: RunResult,
+        *,
+        force: bool = False,
+        recording: Path | None = None,
+    ) -> None:
+        self.verdict = result.verdict or Verdict("refused", ("the pipeline judged nothing",), {})
+        self.pair: Pair | None = result.pair
+        self.report: Sequence[StageRecord] = result.done
+        self.force = force
+        self._result = result
+        self._recording = recording
+        self.outputs = _by_name(result.outputs if recording is None else ())
+        if recording is not None:
+            weakref.finalize(self, shutil.rmtree, recording.parent, ignore_errors=True)
+
+    @cached_property
+    def T_target_source(self) -> Floats | None:
+        """4x4 on the coordinates as they stand in the inputs, source to target; None if none was found.
+
+        It stands here even when refused: look at the verdict. Where a coordinate operation lies between
+        both, it is the best fit; `apply` goes the exact way.
+        """
+        return None if self._chain is None else self._chain.T_file
+
+    @cached_property
+    def T_source_target(self) -> Floats | None:
+        """4x4 from target to source, the inverse of `T_target_source`."""
+        T = self.T_target_source
+        return None if T is None else np.asarray(np.linalg.inv(T), np.float64)
+
+    @overload
+    def apply(self, points: str | os.PathLike[str] | Cloud, *, force: bool = ...) -> Cloud: ...  # type: ignore[overload-overlap]
+    @overload
+    def apply(self, points: ArrayLike, *, force: bool = ...) -> Floats: ...
+    def apply(self, points: CloudLike, *, force: bool = False) -> Floats | Cloud:
+        """Move points from the source's frame to the target's, in the target's CRS and units.
+
+        Args:
+            points: (n, 3) coordinates in the source's CRS and units; or a file, `laspy.LasData` or `Cloud`.
+            force: move them though the verdict is refused.
+
+        Returns:
+            (n, 3) float64 for an array; else a `Cloud` that streams the moved points with all dimensions.
+
+        Raises:
+            RegistrationError: if no transform was found, or the verdict is refused.
+            InputError: if the points are none.
+            CrsError: if a cloud is not in the source's CRS.
+
+        """
+        return move(self.chain(force=force), points)
+
+    @overload
+    def inverse(self, points: str | os.PathLike[str] | Cloud, *, force: bool = ...) -> Cloud: ...  # type: ignore[overload-overlap]
+    @overload
+    def inverse(self, points: ArrayLike, *, force: bool = ...) -> Floats: ...
+    def inverse(self, points: CloudLike, *, force: bool = False) -> Floats | Cloud:
+        """Move points from the target's frame to the source's: the way back of `apply`.
+
+        Args and errors are those of `apply`, with source and target exchanged.
+        """
+        return move(self.chain(force=force), points, inverse=True)
+
+    def chain(self, *, force: bool = False) -> TransformChain:
+        """Return the way of a point from source to target coordinates, step by step.
+
+        Args:
+            force: return it though the verdict is refused.
+
+        Raises:
+            RegistrationError: if no transform was found, or the verdict is refused.
+
+        """
+        reasons = "; ".join(self.verdict.reasons)
+        if self._chain is None:
+            raise RegistrationError(f"no transform was found: {reasons}")
+        if self.verdict.name == "refused" and not (force or self.force):
+            raise RegistrationError(
+                f"the verdict is refused: {reasons}; force=True uses the transform anyway"
+            )
+        return self._chain
+
+    def plot(self) -> Figure:
+        """Draw the registered source over the target, and the difference of their lowest heights.
+
+        Returns:
+            A matplotlib figure; notebooks show it, ``savefig`` writes it.
+
+        Raises:
+            MissingPartError: if matplotlib is not installed.
+            RegistrationError: if the clouds were not even rasterised.
+
+        """
+        try:
+            from mtpcr_geo.export.figure import registration_figure
+        except ImportError as error:
+            raise MissingPartError(f"plot() needs matplotlib ({error}): pip install matplotlib") from error
+        if self.pair is None or self.pair.source.bev is None or self.pair.target.bev is None:
+            raise RegistrationError(f"there is nothing to plot: {'; '.join(self.verdict.reasons)}")
+        names = " to ".join(Path(side.cloud.name).name for side in (self.pair.source, self.pair.target))
+        return registration_figure(self.pair, f"{names}: {self.verdict.name}")
+
+    def save(
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        overwrite: bool = False,
+        force: bool = False,
+        progress: Progress | None = None,
+    ) -> dict[str, Path]:
+        """Write what the command ``register`` writes: the registered cloud, its transform, the evidence.
+
+        Input files are read again for the registered cloud and their hashes; arrays must not have been
+        changed since. The recording is among the files where `register` was called with recording=True.
+        A refused registration leaves its evidence only.
+
+        Args:
+            folder: made if it is not there.
+            overwrite: replace files that are already there.
+            force: write cloud and transform though the verdict is refused.
+            progress: where long work reports.
+
+        Returns:
+            The files written, by what they are, which is also in `outputs`.
+
+        Raises:
+            OutputError: if a file exists already or cannot be written; nothing is left then.
+            InputError: if an input file has changed since.
+
+        """
+        stages = writers_of(Path(folder), force=force or self.force, recording=self._recording)
+        last = [tag for tag, value in self._result.values.items() if value is self.pair and value is not None]
+        nodes = chained(stages, tuple(last[-1:]))
+        self.outputs = _by_name(
+            run(nodes, overwrite=overwrite, progress=progress, before=self._result).outputs
+        )
+        return self.outputs
+
+    def __repr__(self) -> str:
+        rows = self._rows()
+        width = max((len(name) for name, _ in rows), default=0)
+        lines = [f"Registration: {self.verdict.name}"]
+        return "\n".join(lines + [f"  {name:<{width}}  {text}" for name, text in rows])
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{escape(name)}</th>"
+            f"<td style='text-align:left'>{escape(text)}</td></tr>"
+            for name, text in self._rows()
+        )
+        return f"<div><b>Registration: {escape(self.verdict.name)}</b><table>{rows}</table></div>"
+
+    def _rows(self) -> list[tuple[str, str]]:
+        """Return what moves, how, and the reasons of the verdict, as (name, text)."""
+        rows = []
+        if self.pair is not None:
+            names = (Path(side.cloud.name).name for side in (self.pair.source, self.pair.target))
+            rows.append(("clouds", " to ".join(names)))
+            if self.pair.T_target_source is not None:
+                rows.append(("transform", _transform_text(self.pair)))
+        overlap = self.verdict.metrics.get("overlap_m2")
+        if overlap is not None:
+            shares = [
+                f"{self.verdict.metrics[f'overlap_{role}']:.0%} of the {role}"
+                for role in ("source", "target")
+            ]
+            rows.append(("overlap", f"{overlap:,.0f} m², {' and '.join(shares)}"))
+        return rows + [("reason", reason) for reason in self.verdict.reasons[:2]]
+
+    @cached_property
+    def _chain(self) -> TransformChain | None:
+        solved = self.pair is not None and self.pair.T_target_source is not None
+        return TransformChain.of(cast(Pair, self.pair)) if solved else None
 
 
 def register(
-    source: str | Path,
-    target: str | Path,
-    out: str | Path,
+    source: CloudLike,
+    target: CloudLike,
+    out: str | os.PathLike[str] | None = None,
     *,
     progress: Progress | None = None,
     **options: Any,
 ) -> Registration:
-    """Bring the source cloud to the target cloud, and leave the result and its evidence in a folder.
+    """Bring the source cloud to the target cloud.
+
+    Nothing is written unless a folder is given; `Registration.save` writes the same files later.
 
     Args:
-        source: LAS, LAZ or COPC file that moves.
-        target: LAS, LAZ or COPC file that stays.
-        out: folder for the outputs; made if it is not there.
+        source: the cloud that moves: a LAS, LAZ or COPC file; (n, 3) coordinates in metres; `laspy.LasData`;
+            or a `Cloud`.
+        target: the cloud that stays, likewise.
+        out: folder for the result and its evidence; made if it is not there.
         progress: where long work reports.
-        options: fields of `RegisterOptions`.
+        options: fields of `mtpcr_geo.pipeline.options.RegisterOptions`. Arrays are local unless `source_crs`
+            or `target_crs` names a CRS. A recording is kept where a folder is given, or with recording=True.
+
+    Returns:
+        What it came to. A registration that finds nothing is refused, and no error.
 
     Raises:
         MtpcrError: for whatever a user can cause, before anything is written.
 
     """
-    chosen = read_options(options)
-    specs = grammar.link(grammar.parse(grammar.dump(build_pipeline(source, target, out, chosen))))
-    result = execute(specs, Settings(overwrite=chosen.overwrite), progress)
-    return registration_of(result)
+    chosen = read_options({"recording": out is not None, **options})
+    if out is None and chosen.overwrite:
+        raise OptionError("overwrite is of use with a folder only: give out, or save(folder, overwrite=True)")
+    readers = [reader_of(target, "target"), reader_of(source, "source")]
+    _check_two(readers)
+    chosen = chosen.model_copy(update=_crs_of_arrays(chosen, source, target))
+    steps = chained(steps_of(chosen), ("target", "source"))
+    nodes = [*chained(readers[:1]), *chained(readers[1:]), *steps]
+    if out is not None:
+        writers = writers_of(Path(out), force=chosen.force, recorded=chosen.recording)
+        nodes += chained(writers, (nodes[-1].tag,))
+        return Registration(run(nodes, overwrite=chosen.overwrite, progress=progress), force=chosen.force)
+    if not chosen.recording:
+        return Registration(run(nodes, progress=progress), force=chosen.force)
+    # kept aside until it is saved, and gone with what is returned
+    folder = Path(tempfile.mkdtemp(prefix="mtpcr-geo-"))
+    nodes += chained([recording_writer(folder)], (nodes[-1].tag,))
+    try:
+        result = run(nodes, progress=progress)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return Registration(result, force=chosen.force, recording=folder / OUTPUT_NAMES["recording"])
+
+
+def apply(
+    transform: Registration | str | os.PathLike[str],
+    points: CloudLike,
+    out: str | os.PathLike[str] | None = None,
+    *,
+    inverse: bool = False,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Floats | Cloud | Path:
+    """Move points by the transform of a registration.
+
+    Args:
+        transform: a registration, or the ``transform.json`` of one.
+        points: (n, 3) coordinates in the source's CRS and units (in the target's with `inverse`); or a file,
+            `laspy.LasData` or `Cloud`.
+        out: a LAS, LAZ or COPC file to write the moved cloud to; nothing is written if not given.
+        inverse: go from target to source.
+        overwrite: replace `out` if it is there.
+        progress: where to report the points written.
+
+    Returns:
+        The file written; else (n, 3) float64 for an array, and for others a `Cloud` that streams the moved
+        points.
+
+    Raises:
+        RegistrationError: if no transform was found, or the verdict is refused.
+        InputError: if an input cannot be read.
+        CrsError: if a cloud is not in the frame from which the transform starts.
+        OutputError: if the output cannot be written, or exists.
+
+    """
+    if not isinstance(transform, Registration):
+        from mtpcr_geo.export.transform import read_transform
+
+        chain = read_transform(Path(transform))
+    else:
+        chain = transform.chain()
+    if out is None:
+        return move(chain, points, inverse=inverse)
+    moved = moved_by(chain, cloud_of(points, "points"), inverse=inverse)
+    write_moved(Path(out), moved, overwrite=overwrite, progress=progress)
+    return Path(out)
 
 
 def build_pipeline(
     source: str | Path, target: str | Path, out: str | Path, options: RegisterOptions
 ) -> list[dict[str, Any]]:
-    """Name the stages of a registration, as pipeline JSON."""
-    folder = Path(out)
-    where = {name: str(folder / file) for name, file in OUTPUT_NAMES.items()}
-    stages: list[dict[str, Any]] = [
-        _reader(target, "target"),
-        _reader(source, "source"),
-        *steps_of(options, inputs=["target", "source"]),
-        {"type": "mtpcr.write_bev", "tag": "rasters", "filename": where["bev"]},
-        {"type": "mtpcr.write_tie_points", "tag": "tie_points", "filename": where["tie_points"]},
-        *(
-            {"type": "mtpcr.write_transform", "tag": tag, "filename": where[tag], "force": options.force}
-            for tag in ("transform", "matrix", "pdal")
-        ),
-        {"type": "mtpcr.write_report", "tag": "report", "filename": where["report"]},
-        {"type": "mtpcr.write_run", "tag": "run", "filename": where["run"]},
-        {"type": "mtpcr.apply", "tag": "moved", "force": options.force},
-        {"type": "writers.las", "tag": "registered", "filename": where["registered"]},
+    """Name the stages of a registration of two files, as pipeline JSON.
+
+    Options at their default are left out.
+    """
+    readers = [reader_of(target, "target"), reader_of(source, "source")]
+    steps = chained(steps_of(options), ("target", "source"))
+    writers = writers_of(Path(out), force=options.force, recorded=options.recording)
+    nodes = [*chained(readers[:1]), *chained(readers[1:]), *steps, *chained(writers, (steps[-1].tag,))]
+    # a single input is the stage before
+    return [
+        {key: value for key, value in node.audit().items() if key != "inputs" or len(node.inputs) > 1}
+        for node in nodes
     ]
-    if options.recording:
-        before = next(i for i, stage in enumerate(stages) if stage["type"] == "mtpcr.write_report")
-        stages.insert(
-            before, {"type": "mtpcr.write_recording", "tag": "recording", "filename": where["recording"]}
-        )
-    return [without_defaults(stage) for stage in stages]
 
 
 def read_options(options: dict[str, Any]) -> RegisterOptions:
@@ -115,15 +360,52 @@ def read_options(options: dict[str, Any]) -> RegisterOptions:
 
 def registration_of(result: RunResult) -> Registration:
     """Gather what a registering pipeline came to."""
-    verdict = result.verdict or Verdict("refused", ("the pipeline judged nothing",), {})
-    pair = result.pair
-    T = TransformChain.of(pair).T_file if pair is not None and pair.T_target_source is not None else None
+    return Registration(result)
+
+
+def _check_two(readers: Sequence[Stage]) -> None:
+    """Refuse one cloud given as both: it would fit itself perfectly. Files are compared when they are read.
+
+    Raises:
+        InputError: if both are the same.
+
+    """
+    clouds = [reader.cloud for reader in readers if isinstance(reader, MemoryReader)]
+    if len(clouds) < 2:
+        return
+    first, second = clouds
+    same = first is second
+    if isinstance(first, ArrayCloud) and isinstance(second, ArrayCloud):
+        same = same or np.array_equal(first.xyz, second.xyz)
+    if same:
+        raise InputError("source and target hold the same points; give two different clouds")
+
+
+def _crs_of_arrays(options: RegisterOptions, source: CloudLike, target: CloudLike) -> dict[str, str]:
+    """Take arrays as local where no CRS is named."""
+    named = {"source": options.source_crs, "target": options.target_crs}
+    return {
+        f"{role}_crs": "local"
+        for role, cloud in (("source", source), ("target", target))
+        if named[role] is None and not options.local and is_array(cloud)
+    }
+
+
+def _by_name(paths: Sequence[Path]) -> dict[str, Path]:
+    """Return files of a registration by what they are."""
     names = {path.name: name for name, path in OUTPUT_NAMES.items()}
     names |= {f"{role}.tif": f"bev_{role}" for role in ("source", "target", "registered")}
-    outputs = {names.get(path.name, path.stem): path for path in result.outputs}
-    return Registration(verdict, T, pair, outputs, result.done)
+    return {names.get(path.name, path.stem): path for path in paths}
 
 
-def _reader(path: str | Path, tag: str) -> dict[str, Any]:
-    kind = "readers.copc" if str(path).lower().endswith(".copc.laz") else "readers.las"
-    return {"type": kind, "tag": tag, "filename": str(path)}
+def _transform_text(pair: Pair) -> str:
+    """Say what the transform does, in one line."""
+    from mtpcr_geo.export.descriptions import shift_text
+
+    assert pair.T_target_source is not None
+    R = pair.T_target_source[:3, :3]
+    yaw = transforms.yaw_of(R)
+    tilt = math.degrees(transforms.rotation_angle(transforms.yaw_matrix(yaw).T @ R))
+    shift = shift_text(pair)
+    text = f"yaw {math.degrees(yaw):+.3f}°, tilt {tilt:.3f}°"
+    return f"{text}, the middle moves by {shift}" if shift else text

@@ -34,8 +34,8 @@ def main() -> None:
         path = folder / f"{role}.pth"
         torch.save(np.load(getattr(options, role)) / options.scale, path)
         replace(config, key, str(path))
-    ours = folder / "config.yaml"
-    ours.write_text(yaml.safe_dump(config))
+    own_config = folder / "config.yaml"
+    own_config.write_text(yaml.safe_dump(config))
     # its modules and weights are found from its checkout
     os.chdir(options.checkout)
     sys.path.insert(0, os.getcwd())
@@ -50,7 +50,7 @@ def main() -> None:
         raise SystemExit(0)
 
     kit.ransac_pose_estimation = kept
-    sys.argv = ["scripts/demo.py", str(ours)]
+    sys.argv = ["scripts/demo.py", str(own_config)]
     runpy.run_path("scripts/demo.py", run_name="__main__")
 
 

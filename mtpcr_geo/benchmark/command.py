@@ -1,4 +1,4 @@
-"""The verb `benchmark` of the command."""
+"""The verbs ``benchmark`` and ``simulate`` of the command, loaded by name when they are called."""
 
 from __future__ import annotations
 
@@ -6,8 +6,13 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from pydantic import Field
 
+from mtpcr_geo.benchmark.simulator.options import PairOptions
+from mtpcr_geo.cli.options import Quiet as QuietOption
+from mtpcr_geo.cli.parameters import command_of
 from mtpcr_geo.cli.shared import Quiet, progress_bars
+from mtpcr_geo.pipeline.options import RUN, Overwrite, Shown
 
 
 def benchmark(
@@ -48,10 +53,10 @@ def benchmark(
 
     An interrupted benchmark goes on where it stopped when the same command is given again.
     """
-    from mtpcr_geo.benchmark.runs import Wanted, numbers_of, run_benchmark, shown
+    from mtpcr_geo.benchmark.runs import PairSelection, numbers_of, run_benchmark, shown
     from mtpcr_geo.benchmark.worker import StartRange
 
-    wanted = Wanted(
+    selection = PairSelection(
         tuple(data or ()),
         simulated,
         standins,
@@ -62,7 +67,7 @@ def benchmark(
     )
     with progress_bars(quiet) as progress:
         rows = run_benchmark(
-            wanted,
+            selection,
             [word for text in methods for word in text.split()],
             out,
             pairs=pairs,
@@ -74,3 +79,47 @@ def benchmark(
         )
     if not quiet:
         typer.echo(shown(rows) + f"\nTables and plots: {out}")
+
+
+class SimulateVerb(PairOptions):
+    """Options of ``simulate``."""
+
+    out: Annotated[
+        Path,
+        Field(description="folder in which each pair gets a folder of its own"),
+        Shown(RUN, argument=True),
+    ]
+    count: Annotated[int, Field(ge=1, description="number of pairs; each has the next seed"), Shown(RUN)] = 1
+    overwrite: Overwrite = False
+    quiet: QuietOption = False
+
+
+def _simulate(given: SimulateVerb) -> None:
+    """Simulate pairs of a ground and an aerial cloud with a known transform (extra: benchmark).
+
+    A pair's folder, such as town_0, holds source.laz (ground), target.laz (aerial) and pair.json with the
+    transform: what `mtpcr-geo benchmark --data` runs on. Needs the extra benchmark.
+
+    Examples:
+        mtpcr-geo simulate pairs
+        mtpcr-geo simulate pairs --kind forest --seed 3 --count 2 --overlap 0.1
+
+    """
+    from mtpcr_geo.benchmark.simulator.pairs import simulate_from, write_pair
+
+    first = PairOptions(**{name: getattr(given, name) for name in PairOptions.model_fields})
+    with progress_bars(given.quiet) as progress, progress.task("simulating pairs", given.count) as advance:
+        for seed in range(first.seed, first.seed + given.count):
+            pair = simulate_from(first.model_copy(update={"seed": seed}))
+            folder = given.out / pair.name
+            write_pair(folder, pair, overwrite=given.overwrite)
+            if not given.quiet:
+                typer.echo(
+                    f"{folder}: {pair.source.count:,} ground and {pair.target.count:,} aerial points; "
+                    f"{pair.overlap_source:.0%} of the ground cloud's cells and {pair.overlap_target:.0%} of "
+                    "the aerial one's are shared"
+                )
+            advance(1)
+
+
+simulate = command_of(SimulateVerb, _simulate)

@@ -19,14 +19,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from mtpcr_geo.benchmark.published import COMBINATIONS, Combination
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.errors import InputError, MissingPartError
+from mtpcr_geo.core.voxels import first_in_voxels
 
-Floats = NDArray[np.float64]
 POINTS_TOPIC = "/velodyne/points"
 TRUTH_TOPIC = "/gnss/ground_truth"
 LARGEST_GAP_S = 0.25
@@ -55,8 +55,8 @@ class Trajectory:
         places = np.stack([np.interp(time, self.time, self.position[:, k]) for k in range(3)], axis=1)
         return Slerp(self.time, self.rotation)(time), places
 
-    def covers(self, time: Floats) -> NDArray[np.bool_]:
-        """Say which of (k,) times lie between two poses that are not too far apart to interpolate."""
+    def covers(self, time: Floats) -> Mask:
+        """Return which of (k,) times lie between two poses that are not too far apart to interpolate."""
         after = np.searchsorted(self.time, time, side="left")
         known = (time >= self.time[0]) & (time <= self.time[-1])
         after = np.clip(after, 1, len(self.time) - 1)
@@ -142,7 +142,7 @@ def read_sequence(
     *,
     voxel_m: float = 0.1,
     every: int = 1,
-    reach_m: tuple[float, float] = (1.0, 120.0),
+    range_m: tuple[float, float] = (1.0, 120.0),
     points_topic: str = POINTS_TOPIC,
     truth_topic: str = TRUTH_TOPIC,
 ) -> Floats:
@@ -153,7 +153,7 @@ def read_sequence(
         T_imu_lidar: 4x4, lidar to IMU.
         voxel_m: thinned to the first point in each voxel of this edge, metres; 0 keeps all.
         every: use each n-th scan.
-        reach_m: nearest and farthest range kept, metres.
+        range_m: nearest and farthest range kept, metres.
         points_topic, truth_topic: topics of PointCloud2 and Odometry.
 
     Returns:
@@ -174,7 +174,7 @@ def read_sequence(
                 continue
             xyz, time = points_of(message)
             distance = np.linalg.norm(xyz, axis=1)
-            keep = (distance >= reach_m[0]) & (distance <= reach_m[1]) & path.covers(time)
+            keep = (distance >= range_m[0]) & (distance <= range_m[1]) & path.covers(time)
             parts.append(place(xyz[keep], time[keep], path, T_imu_lidar))
             held += len(parts[-1])
             if voxel_m > 0 and held > limit:
@@ -259,7 +259,7 @@ def _open(bag: Path) -> Iterator[Any]:
             "GrAco's bags need rosbags, which is not installed; run pip install 'mtpcr-geo[graco]'"
         ) from error
     try:
-        # older ROS 2 bags do not say how their messages are made up
+        # older ROS 2 bags do not hold the definitions of their messages
         with AnyReader([Path(bag)], default_typestore=get_typestore(Stores.ROS2_FOXY)) as reader:
             yield reader
     except (AnyReaderError, OSError) as error:
@@ -267,8 +267,5 @@ def _open(bag: Path) -> Iterator[Any]:
 
 
 def _thinned(xyz: Floats, voxel: float) -> Floats:
-    cell = np.floor(xyz / voxel).astype(np.int64)
-    cell -= cell.min(axis=0)
-    size = cell.max(axis=0) + 1
-    _, first = np.unique((cell[:, 2] * size[1] + cell[:, 1]) * size[0] + cell[:, 0], return_index=True)
-    return np.asarray(xyz[np.sort(first)])
+    # a lattice from the origin, so that thinning twice leaves what thinning once does
+    return np.asarray(xyz[first_in_voxels(xyz, voxel, np.zeros(3))])

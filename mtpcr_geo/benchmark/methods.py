@@ -1,6 +1,6 @@
 """What the benchmark asks of a method, and which methods there are.
 
-A method is named on the command line by its name and, where wanted, options of its own:
+A method is named on the command line by its name and, after a colon, its options:
 ``fpfh-ransac:voxel=1.5,icp=false``. The label in the tables is that text.
 """
 
@@ -13,14 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mtpcr_geo.benchmark.simulator.raycast import import_open3d
+from mtpcr_geo.benchmark.baselines.open3d import import_open3d
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import MissingPartError, OptionError
 from mtpcr_geo.core.suggestions import meant
 
-Floats = NDArray[np.float64]
 Judgement = Literal["accepted", "doubtful", "refused", "unjudged"]
 
 
@@ -30,8 +27,8 @@ class Estimate:
 
     Attributes:
         T_target_source: 4x4, or None where it found nothing.
-        verdict: its own; "unjudged" from a method that never doubts its answer.
-        reason: why it refuses or doubts, or what it says.
+        verdict: its own; "unjudged" from a method without one.
+        reason: why it refuses or doubts, or its message.
         details: numbers worth keeping with the run.
         memory_mib: peak memory where the method ran elsewhere; else it is measured around the call.
 
@@ -74,7 +71,7 @@ _KISS = "mtpcr_geo.benchmark.baselines.kiss"
 METHODS: dict[str, _Entry] = {
     "mtpcr-geo": _Entry(
         "mtpcr_geo.benchmark.own_method",
-        "Ours",
+        "RegistrationMethod",
         ("cv2", "scipy.fft", "scipy.ndimage", "scipy.spatial", "small_gicp"),
     ),
     "icp": _Entry("mtpcr_geo.benchmark.baselines.icp", "PointToPointIcp", ("small_gicp",)),
@@ -134,7 +131,7 @@ def load_libraries(spec: str) -> None:
 
 
 def options_of(spec: str) -> dict[str, Any]:
-    """Read the options in a method's text: numbers, yes and no, or words.
+    """Read the options in a method's text: numbers, yes and no, or text.
 
     Raises:
         OptionError: if one is not of the form ``option=value``.

@@ -11,12 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.simulator.overlap import near_shares, occupied_cells
 from mtpcr_geo.core import transforms
-
-Floats = NDArray[np.float64]
+from mtpcr_geo.core.arrays import Floats
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Our own method as the benchmark runs it: the stages that `register` builds, on clouds in memory."""
+"""The registration as the benchmark runs it: the stages that `register` builds, on clouds in memory."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.methods import Estimate
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.progress import NoProgress
@@ -20,11 +20,10 @@ from mtpcr_geo.pipeline.registry import make_options, stage_types
 from mtpcr_geo.pipeline.stage import RunContext, Stage, Value
 from mtpcr_geo.registration import build_pipeline, read_options
 
-Floats = NDArray[np.float64]
 _FIRST, _LAST = "mtpcr.level", "mtpcr.assess"
 
 
-class Ours:
+class RegistrationMethod:
     """The registration from levelling to verdict, without reading and writing files.
 
     Args:
@@ -37,7 +36,7 @@ class Ours:
         self._stages(0)
 
     def estimate(self, source: Floats, target: Floats, *, seed: int) -> Estimate:
-        """Register the source to the target; a refused answer is handed on as such."""
+        """Register the source to the target; a refusal is returned as one."""
         value: list[Value] = [ArrayCloud(target, None, "target"), ArrayCloud(source, None, "source")]
         with OutputSet() as outputs:
             context = RunContext(outputs, NoProgress())
@@ -69,7 +68,7 @@ class Ours:
         known = stage_types()
         stages = []
         for spec in chain:
-            words = {key: value for key, value in spec.items() if key not in ("type", "tag", "inputs")}
+            given = {key: value for key, value in spec.items() if key not in ("type", "tag", "inputs")}
             kind = known[spec["type"]]
-            stages.append(kind(make_options(spec["type"], kind.Options, words), str(spec.get("tag", ""))))
+            stages.append(kind(make_options(spec["type"], kind.Options, given), str(spec.get("tag", ""))))
         return stages

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import InputError
-
-Floats = NDArray[np.float64]
+from mtpcr_geo.io.outputs import OutputSet
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class BenchmarkPair:
 
     Attributes:
         name: the folder's.
-        group: which group of the tables it belongs to, such as "A-G"; "pairs" where none is said.
+        group: which group of the tables it belongs to, such as "A-G"; "pairs" where it names none.
         source: (n, 3) where it truly lies, noise and held out points left out.
         target: (m, 3), likewise.
         origin: (3,) the frame's origin in the target's file coordinates, whole metres.
@@ -108,15 +108,65 @@ def load_pair(folder: Path) -> BenchmarkPair:
     low, high = transforms.bounds(target)
     origin = np.floor((low + high) / 2)
     T_local_source = transforms.translation(-origin) @ true_transform(facts)
-    said = facts.get("benchmark", {})
+    labels = facts.get("benchmark", {})
     return BenchmarkPair(
         name=folder.name,
-        group=str(said.get("group", "pairs")),
+        group=str(labels.get("group", "pairs")),
         source=transforms.apply(T_local_source, source),
         target=target - origin,
         origin=origin,
         overlap_cell_m=float(facts.get("overlap", {}).get("cell_m", 1.0)),
     )
+
+
+def write_folder(
+    folder: Path, source: ArrayCloud, target: ArrayCloud, facts: dict[str, Any], *, overwrite: bool = False
+) -> list[Path]:
+    """Write a pair's folder: ``source.laz``, ``target.laz`` (LAS 1.4, point format 6) and ``pair.json``.
+
+    Args:
+        folder: where to; made if missing.
+        source, target: the clouds.
+        facts: what ``pair.json`` holds.
+        overwrite: whether files there may be replaced.
+
+    Returns:
+        The paths written.
+
+    Raises:
+        OutputError: if a file exists already or the folder cannot be written.
+
+    """
+    with OutputSet(overwrite) as out:
+        for name, cloud in (("source.laz", source), ("target.laz", target)):
+            write_laz(out.path(folder / name), cloud)
+        # the last: a folder without it is an interrupted one
+        out.path(folder / "pair.json").write_text(json.dumps(facts, indent=1) + "\n", "utf-8")
+        return out.commit()
+
+
+def write_laz(path: Path, cloud: ArrayCloud) -> None:
+    """Write a cloud held in memory as LAS 1.4 point format 6, scale 0.001, with its CRS as WKT."""
+    import laspy
+
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = np.full(3, 0.001)
+    header.offsets = np.floor(cloud.minimum) if cloud.count else np.zeros(3)
+    header.global_encoding.wkt = True
+    if cloud.crs is not None:
+        header.add_crs(cloud.crs)
+    las = laspy.LasData(header)
+    las.xyz = cloud.xyz
+    for name, field in (
+        ("Intensity", "intensity"),
+        ("ReturnNumber", "return_number"),
+        ("NumberOfReturns", "number_of_returns"),
+        ("Classification", "classification"),
+        ("GpsTime", "gps_time"),
+    ):
+        if name in cloud.extra:
+            las[field] = cloud.extra[name]
+    las.write(str(path))
 
 
 def _points(path: Path) -> Floats:

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.methods import options_of
 from mtpcr_geo.benchmark.tables import LENIENT, Row, answered, grouped, success
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import MissingPartError
 
-Floats = NDArray[np.float64]
 # hues that also differ in lightness, so that they stay apart in grey and for most colour-blind readers
 COLOURS = ("#0b3c8c", "#d1491b", "#2a9d6f", "#8b5fbf", "#c99a1d", "#56a3d9", "#7a7a7a", "#b5446e")
 DASHES: tuple[str, ...] = ("-", "--", "-.", ":")

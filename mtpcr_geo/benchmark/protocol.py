@@ -41,11 +41,11 @@ FRAME = "metres; origin at the middle of the target's bounds; z up"
 
 @dataclass
 class _Running:
-    """A task under way: its process, when it last said something, and what is known of its current run."""
+    """A task under way: its process, when its last message came, and what is known of its current run."""
 
     task: Task
     process: SpawnProcess
-    said: float
+    last_message: float
     left: deque[int]
     begun: Row | None = None
 
@@ -199,12 +199,12 @@ def _drive(waiting: deque[Task], jobs: int, limit: float, file: TextIO, advance:
                 theirs.close()
                 running[mine] = _Running(task, process, time.monotonic(), deque(task.starts))
             now = time.monotonic()
-            due = [one.said + _patience(one, limit) - now for one in running.values()]
+            due = [one.last_message + _patience(one, limit) - now for one in running.values()]
             for pipe in wait(list(running), max(0.0, min(due))):
                 assert isinstance(pipe, Connection)
                 one = running[pipe]
                 kind, what = _received(pipe)
-                one.said = time.monotonic()
+                one.last_message = time.monotonic()
                 if kind == "row":
                     one.left.popleft()
                     write(what)
@@ -218,7 +218,7 @@ def _drive(waiting: deque[Task], jobs: int, limit: float, file: TextIO, advance:
                     if kind == "gone":
                         _ended(one, give_up)
             for pipe, one in list(running.items()):
-                seconds = time.monotonic() - one.said
+                seconds = time.monotonic() - one.last_message
                 if seconds > _patience(one, limit):
                     del running[pipe]
                     one.process.kill()
@@ -267,4 +267,4 @@ def _ended(one: _Running, give_up: Any) -> None:
             f"(exit code {code}); see {one.task.log}"
         )
     if one.left:
-        give_up(one, f"the process ended with exit code {code}", time.monotonic() - one.said)
+        give_up(one, f"the process ended with exit code {code}", time.monotonic() - one.last_message)

@@ -1,7 +1,7 @@
-"""The figures that the paper prints, to stand beside ours.
+"""The figures that the paper prints, to stand beside those measured here.
 
 MT-PCR: Leveraging Modality Transformation for Large-Scale Point Cloud Registration with Limited Overlap:
-its Tables I to IV. They were measured by its authors on the GrAco dataset; nothing of ours enters here.
+its Tables I to IV. They were measured by its authors on the GrAco dataset; none was measured here.
 Rows that its source holds but does not print are in `UNPRINTED`.
 """
 
@@ -27,7 +27,7 @@ class Combination(NamedTuple):
         return f"{self.source[0]}-{self.target[0]}"
 
 
-class Scene(NamedTuple):
+class Extent(NamedTuple):
     """A row of Table I: extent in metres, overlap in percent."""
 
     dx_m: float
@@ -58,11 +58,11 @@ COMBINATIONS = (
 """The fourteen of Table II, in its order."""
 
 TABLE_I = {
-    "A03-G03": Scene(440.21, 454.04, 58.58, 14.82, 22.28),
-    "A04-G01": Scene(457.13, 387.83, 32.91, 19.97, 22.9),
-    "A07-G06": Scene(432.11, 492.93, 33.35, 16.09, 18.1),
-    "G04-G05": Scene(558.95, 466.31, 26.72, 66.49, 42.11),
-    "A01-A02": Scene(390.39, 452.18, 57.55, 32.42, 75.19),
+    "A03-G03": Extent(440.21, 454.04, 58.58, 14.82, 22.28),
+    "A04-G01": Extent(457.13, 387.83, 32.91, 19.97, 22.9),
+    "A07-G06": Extent(432.11, 492.93, 33.35, 16.09, 18.1),
+    "G04-G05": Extent(558.95, 466.31, 26.72, 66.49, 42.11),
+    "A01-A02": Extent(390.39, 452.18, 57.55, 32.42, 75.19),
 }
 """Scale and overlap of the five combinations for which the paper gives them."""
 

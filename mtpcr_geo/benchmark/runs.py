@@ -39,7 +39,7 @@ _SHOWN = (
 
 
 @dataclass(frozen=True)
-class Wanted:
+class PairSelection:
     """Which pairs to use; at least one of the first four.
 
     Attributes:
@@ -82,12 +82,12 @@ class Wanted:
         if self.graco is not None:
             out += sources.from_graco(cache, self.graco, self.only, progress=progress)
         if not out:
-            raise OptionError("nothing to run on; say --data, --simulated, --standins or --graco")
+            raise OptionError("nothing to run on; give --data, --simulated, --standins or --graco")
         return out
 
 
 def run_benchmark(
-    wanted: Wanted,
+    selection: PairSelection,
     methods: Sequence[str],
     out: Path,
     *,
@@ -101,7 +101,7 @@ def run_benchmark(
     """Run the protocol and write its results; what an earlier call has run is kept.
 
     Args:
-        wanted: which pairs.
+        selection: which pairs.
         methods: names with options, see `mtpcr_geo.benchmark.methods`.
         out: folder of the results.
         pairs: folder for pairs that must be made; ``pairs`` in `out` if not given.
@@ -113,7 +113,7 @@ def run_benchmark(
     """
     if len(set(methods)) < len(methods):
         raise OptionError("a method is named twice")
-    folders = wanted.folders(pairs or Path(out) / "pairs", progress)
+    folders = selection.folders(pairs or Path(out) / "pairs", progress)
     rows = run_protocol(
         folders,
         methods,
@@ -211,7 +211,7 @@ def _report(rows: Sequence[Row], made: Mapping[str, list[dict[str, Any]]]) -> st
 
 
 def _flat(row: Row) -> dict[str, Any]:
-    """Return a run as one line: success in words of its own, without the matrix and the details."""
+    """Return a run as one line: with its successes, without the matrix and the details."""
     line = {key: value for key, value in row.items() if key not in ("T_target_source", "details")}
     line |= {tables.label(limits): tables.success(row, limits) for limits in tables.THRESHOLDS}
     return line | {"false_accept": tables.false_accept(row)}

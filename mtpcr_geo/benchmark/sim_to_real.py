@@ -10,12 +10,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from mtpcr_geo.benchmark.tables import grouped
+from mtpcr_geo.core.arrays import Floats
 
-Floats = NDArray[np.float64]
 STEP_M = 1.0
 BAND_M = 12.0
 QUANTILES = (5, 50, 95)
@@ -96,17 +95,17 @@ def compare(
 
     ``simulated_median`` is "within" the real clouds' range, or "below" or "above" it.
     """
-    ours, theirs = spread(simulated), spread(real)
+    of_simulated, of_real = spread(simulated), spread(real)
     lines = []
-    for name, (low, median, high) in theirs.items():
-        middle = ours[name][1]
+    for name, (low, median, high) in of_real.items():
+        middle = of_simulated[name][1]
         lies = "below" if middle < low else "above" if middle > high else "within"
         lines.append(
             {
                 "figure": name,
-                "simulated_min": ours[name][0],
+                "simulated_min": of_simulated[name][0],
                 "simulated_mid": middle,
-                "simulated_max": ours[name][2],
+                "simulated_max": of_simulated[name][2],
                 "real_min": low,
                 "real_mid": median,
                 "real_max": high,
@@ -117,7 +116,7 @@ def compare(
 
 
 def margins(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Gather the hypothesis margins of our runs by pair: lowest, median and highest.
+    """Gather the hypothesis margins of the registration's runs by pair: lowest, median and highest.
 
     The margin is how many times stronger the best pose is than the next distinct one: the verdict's metric
     ``hypothesis_margin``.

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mtpcr_geo.benchmark.pairs import write_folder
 from mtpcr_geo.benchmark.simulator.kinds import KINDS, Kind
-from mtpcr_geo.benchmark.simulator.pairs import simulate_pair, write_laz, write_pair
+from mtpcr_geo.benchmark.simulator.pairs import simulate_pair, write_pair
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import InputError, OptionError
 from mtpcr_geo.core.progress import NoProgress
-from mtpcr_geo.io.outputs import OutputSet
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.progress import Progress
@@ -55,7 +54,6 @@ def simulated(
             for overlap in overlaps:
                 place = Path(folder) / f"{kind}_{seed + number}_overlap{100 * overlap:g}"
                 if not (place / "pair.json").exists():
-                    # written last: a folder without it is an interrupted one
                     write_pair(
                         place, simulate_pair(kind, seed + number, overlap=overlap, **options), overwrite=True
                     )
@@ -160,8 +158,5 @@ def _write_common_frame(
         },
         "benchmark": {"group": group, "source": names[0], "target": names[1], "extent_m": extent},
     }
-    with OutputSet(overwrite=True) as out:
-        for role, xyz in (("source", source), ("target", target)):
-            write_laz(out.path(place / f"{role}.laz"), ArrayCloud(xyz, None, role))
-        out.path(place / "pair.json").write_text(json.dumps(facts, indent=1) + "\n", "utf-8")
-        out.commit()
+    clouds = ArrayCloud(source, None, "source"), ArrayCloud(target, None, "target")
+    write_folder(place, *clouds, facts, overwrite=True)

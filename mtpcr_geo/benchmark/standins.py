@@ -3,8 +3,8 @@
 They are no GrAco. A spinning lidar on a ground robot (G) and one under a UAV (A) scan a simulated site
 whose edge is the paper's extent (Table I), so that the overlaps come near the paper's. For the nine
 combinations for which the paper gives neither, the means of those of the same group are taken. Heights are
-those of the simulated kinds of site, 28 to 43 m from lowest to highest, where the paper's reach
-59 m; what came out stands in each ``pair.json``. Every name begins with ``standin_``.
+those of the simulated kinds of site, 28 to 43 m from lowest to highest, where the paper's go up
+to 59 m; what came out stands in each ``pair.json``. Every name begins with ``standin_``.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mtpcr_geo.benchmark.published import COMBINATIONS, TABLE_I, Combination, Scene
+from mtpcr_geo.benchmark.pairs import write_folder
+from mtpcr_geo.benchmark.published import COMBINATIONS, TABLE_I, Combination, Extent
 from mtpcr_geo.benchmark.simulator import instruments, scanners
 from mtpcr_geo.benchmark.simulator.instruments import Scan
 from mtpcr_geo.benchmark.simulator.kinds import STYLES, Kind
@@ -26,19 +26,17 @@ from mtpcr_geo.benchmark.simulator.pairs import (
     SimulatedPair,
     describe,
     shared_block,
-    thinned,
     walk_through,
-    write_laz,
 )
 from mtpcr_geo.benchmark.simulator.raycast import Caster
 from mtpcr_geo.benchmark.simulator.scanners import Block
 from mtpcr_geo.benchmark.simulator.site import MARGIN_M, Site, make_site
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.io.outputs import OutputSet
+from mtpcr_geo.core.voxels import first_in_voxels
 
-Floats = NDArray[np.float64]
 PREFIX = "standin_"
 # mostly a campus, as the dataset's site was; other kinds now and then, so that nothing fits one only
 KINDS: tuple[Kind, ...] = (
@@ -54,7 +52,7 @@ class StandIn:
 
     Attributes:
         combination: the paper's.
-        scene: extent and overlap aimed at.
+        extent_and_overlap: extent and overlap aimed at.
         given: whether the paper gives them for this combination, or they are means of its group.
         kind: of the site.
         seed: of everything.
@@ -62,7 +60,7 @@ class StandIn:
     """
 
     combination: Combination
-    scene: Scene
+    extent_and_overlap: Extent
     given: bool
     kind: Kind
     seed: int
@@ -114,15 +112,11 @@ def write_stand_in(folder: Path, stand_in: StandIn, *, density: float = 1.0) -> 
             "source": stand_in.combination.source,
             "target": stand_in.combination.target,
             "stand_in": "simulated, with the paper's extent and overlap; not GrAco",
-            "aimed_at": stand_in.scene._asdict(),
+            "aimed_at": stand_in.extent_and_overlap._asdict(),
             "figures": "the paper's Table I" if stand_in.given else "means of the group's rows in Table I",
         }
     }
-    with OutputSet(overwrite=True) as out:
-        for name, cloud in (("source.laz", pair.source), ("target.laz", pair.target)):
-            write_laz(out.path(place / name), cloud)
-        out.path(place / "pair.json").write_text(json.dumps(facts, indent=1) + "\n", "utf-8")
-        out.commit()
+    write_folder(place, pair.source, pair.target, facts, overwrite=True)
     return place
 
 
@@ -134,12 +128,12 @@ def simulate_stand_in(stand_in: StandIn, *, density: float = 1.0) -> SimulatedPa
         density: share of the usual number of beams.
 
     """
-    scene, group = stand_in.scene, stand_in.combination.group
-    extent = float(np.clip(np.sqrt(scene.dx_m * scene.dy_m), 100.0, 1500.0))
+    extent_and_overlap, group = stand_in.extent_and_overlap, stand_in.combination.group
+    extent = float(np.clip(np.sqrt(extent_and_overlap.dx_m * extent_and_overlap.dy_m), 100.0, 1500.0))
     site = make_site(stand_in.kind, stand_in.seed, extent)
     chance = np.random.default_rng([stand_in.seed, 31])
     make = {"A-G": _air_ground, "G-G": _ground_ground, "A-A": _air_air}[group]
-    source, target = make(site, scene, density, chance)
+    source, target = make(site, extent_and_overlap, density, chance)
     shares = near_shares(occupied_cells(source.xyz), occupied_cells(target.xyz))
     # each in a frame of its own, like maps that know nothing of one another
     T_source_site, T_target_site = (
@@ -166,30 +160,36 @@ def simulate_stand_in(stand_in: StandIn, *, density: float = 1.0) -> SimulatedPa
     )
 
 
-def _typical(group: str) -> Scene:
+def _typical(group: str) -> Extent:
     """Return the mean of the group's rows in Table I."""
     rows = [
-        scene for name, scene in TABLE_I.items() if "-".join(part[0] for part in name.split("-")) == group
+        extent_and_overlap
+        for name, extent_and_overlap in TABLE_I.items()
+        if "-".join(part[0] for part in name.split("-")) == group
     ]
-    return Scene(*np.mean(rows, axis=0).round(2).tolist())
+    return Extent(*np.mean(rows, axis=0).round(2).tolist())
 
 
-def _air_ground(site: Site, scene: Scene, density: float, rng: np.random.Generator) -> tuple[Scan, Scan]:
+def _air_ground(
+    site: Site, extent_and_overlap: Extent, density: float, rng: np.random.Generator
+) -> tuple[Scan, Scan]:
     """Fly over a block whose air survey is the source; the robot's drive is the target."""
     yaw = float(rng.uniform(-0.2, 0.2))
     path = walk_through(site, yaw)
     low = _drive(site, path, 0, density, rng)
-    shares = scene.overlap_target_pct / 100, scene.overlap_source_pct / 100
+    shares = extent_and_overlap.overlap_target_pct / 100, extent_and_overlap.overlap_source_pct / 100
     low, block, _ = shared_block(low, path, site, yaw, shares)
     return _fly(site, block, 1, density, rng), low
 
 
-def _ground_ground(site: Site, scene: Scene, density: float, rng: np.random.Generator) -> tuple[Scan, Scan]:
-    """Drive twice, in two epochs, and take the parts of both drives that share what is wanted."""
+def _ground_ground(
+    site: Site, extent_and_overlap: Extent, density: float, rng: np.random.Generator
+) -> tuple[Scan, Scan]:
+    """Drive twice, in two epochs, and take the parts of both drives that share as much as asked."""
     path = walk_through(site, float(rng.uniform(-0.2, 0.2)))
     drives = [_drive(site, path, epoch, density, rng) for epoch in (0, 1)]
     ends = [float(np.max(drive.extra["GpsTime"].astype(np.float64))) for drive in drives]
-    wanted = np.array([scene.overlap_source_pct, scene.overlap_target_pct]) / 100
+    wanted = np.array([extent_and_overlap.overlap_source_pct, extent_and_overlap.overlap_target_pct]) / 100
     # the cells that a drive has seen by each twentieth of its time, from its start and to its end
     steps = np.linspace(0.05, 1.0, 20)
     first = [occupied_cells(_part(drives[0], 0.0, s * ends[0]).xyz) for s in steps]
@@ -207,9 +207,14 @@ def _ground_ground(site: Site, scene: Scene, density: float, rng: np.random.Gene
     )
 
 
-def _air_air(site: Site, scene: Scene, density: float, rng: np.random.Generator) -> tuple[Scan, Scan]:
+def _air_air(
+    site: Site, extent_and_overlap: Extent, density: float, rng: np.random.Generator
+) -> tuple[Scan, Scan]:
     """Fly two blocks side by side that overlap, in two epochs."""
-    first, second = (share / 100 for share in (scene.overlap_source_pct, scene.overlap_target_pct))
+    first, second = (
+        share / 100
+        for share in (extent_and_overlap.overlap_source_pct, extent_and_overlap.overlap_target_pct)
+    )
     # widths a and b with a shared strip s: s = first a = second b, and a + b - s is the whole site
     a = 2 * site.half / (1 + first / second - first)
     b = a * first / second
@@ -225,7 +230,7 @@ def _drive(site: Site, path: Floats, epoch: int, density: float, rng: np.random.
     beams = scanners.robot_beams(path, site.ground.height, int(2_000_000 * density), rng)
     scan = instruments.measure(Caster(site.mesh(epoch)), beams, instruments.ROBOT, rng)
     scan = scan.part(np.abs(scan.xyz[:, :2]).max(axis=1) < site.half + MARGIN_M - 2.0)
-    return scan.part(thinned(scan.xyz, 0.12))
+    return scan.part(first_in_voxels(scan.xyz, 0.12))
 
 
 def _fly(site: Site, block: Block, epoch: int, density: float, rng: np.random.Generator) -> Scan:

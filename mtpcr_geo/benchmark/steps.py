@@ -9,20 +9,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mtpcr_geo.benchmark.memory import peak_mib, reset_peak
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.progress import NoProgress
+from mtpcr_geo.core.system import peak_memory_mb, reset_peak_memory
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.pipeline.registry import make_options, stage_types
 from mtpcr_geo.pipeline.stage import RunContext, Stage, Value
 from mtpcr_geo.registration import build_pipeline, read_options
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -33,7 +31,7 @@ class Outcome:
         pair: as far as it came.
         failure: why it came no further, or None.
         seconds: time of each step, by type.
-        memory_mib: most resident memory meanwhile, everything included; None where the system does not say.
+        memory_mib: most resident memory meanwhile, everything included; None where it is unknown.
 
     """
 
@@ -72,7 +70,7 @@ def follow(pair: Pair, steps: Iterable[Mapping[str, Any]]) -> Outcome:
         MtpcrError: if an option is wrong or a part is missing.
 
     """
-    reset_peak()
+    reset_peak_memory()
     seconds: dict[str, float] = {}
     failure = None
     with OutputSet() as outputs, closing(RunContext(outputs, NoProgress())) as context:
@@ -90,7 +88,7 @@ def follow(pair: Pair, steps: Iterable[Mapping[str, Any]]) -> Outcome:
                 seconds[stage.type] = time.perf_counter() - began
             assert isinstance(made, Pair)
             pair = made
-    return Outcome(pair, failure, seconds, peak_mib())
+    return Outcome(pair, failure, seconds, peak_memory_mb())
 
 
 def random_start(
@@ -106,7 +104,7 @@ def random_start(
     Args:
         rng: of the draw.
         centre: (3,) about which is turned, metres.
-        yaw_deg, shift_m, tilt_deg: the most of each.
+        yaw_deg, shift_m, tilt_deg: the largest of each.
 
     """
     direction = rng.normal(size=3)
@@ -117,7 +115,7 @@ def random_start(
     return transforms.translation(shift) @ transforms.about(centre, R)
 
 
-def _stage(words: Mapping[str, Any]) -> Stage:
-    kind = stage_types()[words["type"]]
-    own = {key: value for key, value in words.items() if key not in ("type", "tag", "inputs")}
-    return kind(make_options(str(words["type"]), kind.Options, own), str(words["tag"]))
+def _stage(step: Mapping[str, Any]) -> Stage:
+    kind = stage_types()[step["type"]]
+    own = {key: value for key, value in step.items() if key not in ("type", "tag", "inputs")}
+    return kind(make_options(str(step["type"]), kind.Options, own), str(step["tag"]))

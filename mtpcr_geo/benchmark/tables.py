@@ -130,7 +130,7 @@ def table_1(extents: Mapping[str, Sequence[float]], rows: Iterable[Row]) -> list
 
 
 def table_2(rows: Iterable[Row]) -> list[dict[str, Any]]:
-    """Remake Table II: mean errors by method and pair, the paper's methods behind ours."""
+    """Remake Table II: mean errors by method and pair, the paper's methods below."""
     rows = list(rows)
     names = {"e_r_deg": "rotation_deg", "e_t_m": "translation_m", "rmsd_m": "rmsd_m"}
     pairs = [pair for (pair,) in grouped(rows, "pair")]
@@ -152,7 +152,7 @@ def table_2(rows: Iterable[Row]) -> list[dict[str, Any]]:
 
 
 def table_3(rows: Iterable[Row], thresholds: tuple[float, float] = LENIENT) -> list[dict[str, Any]]:
-    """Remake Table III: success rates in percent by method and group, the paper's methods behind ours."""
+    """Remake Table III: success rates in percent by method and group, the paper's methods below."""
     rows = list(rows)
     groups = [group for (group,) in grouped(rows, "group")]
     out: list[dict[str, Any]] = []

@@ -10,22 +10,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mtpcr_geo.benchmark import memory
 from mtpcr_geo.benchmark.methods import Estimate, Method, load_libraries, make_method
 from mtpcr_geo.benchmark.metrics import overlap_ratios, pose_errors
 from mtpcr_geo.benchmark.pairs import BenchmarkPair, load_pair
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import MtpcrError, RegistrationError
+from mtpcr_geo.core.system import peak_memory_mb, reset_peak_memory
 
-Floats = NDArray[np.float64]
 SAMPLE = 20_000
 
 
 @dataclass(frozen=True)
 class StartRange:
-    """How a source is thrown off before each run.
+    """The random transforms that displace a source before its runs.
 
     Attributes:
         yaw_deg: turned about the vertical by 0 to this, degrees, about the source's centroid.
@@ -41,7 +40,7 @@ class StartRange:
     seed: int = 0
 
     def draw(self, pair: str, start: int, centroid: Floats) -> tuple[Floats, dict[str, float]]:
-        """Draw one start: the 4x4 that throws the source off, and how it is made up."""
+        """Draw one start: the 4x4 that displaces the source, and its parts."""
         rng = np.random.default_rng([self.seed, start, *pair.encode()])
         yaw, tilt, shift = (rng.uniform(0.0, 1.0, 3) * (self.yaw_deg, self.tilt_deg, self.shift_m)).tolist()
         azimuth = rng.uniform(0.0, 2 * np.pi)
@@ -120,7 +119,7 @@ def run_once(pair: BenchmarkPair, method: Method, T_start: Floats, seed: int) ->
     """
     source = transforms.apply(T_start, pair.source)
     T_true = transforms.inverse(T_start)
-    memory.reset_peak()
+    reset_peak_memory()
     began = time.perf_counter()
     try:
         answer = method.estimate(source, pair.target.copy(), seed=seed)
@@ -133,7 +132,7 @@ def run_once(pair: BenchmarkPair, method: Method, T_start: Floats, seed: int) ->
         "verdict": answer.verdict,
         "reason": answer.reason,
         "time_s": seconds,
-        "memory_mib": memory.peak_mib() if answer.memory_mib is None else answer.memory_mib,
+        "memory_mib": peak_memory_mb() if answer.memory_mib is None else answer.memory_mib,
         "details": answer.details,
     }
     T = answer.T_target_source

@@ -68,6 +68,10 @@ VERBS = {
         "mtpcr_geo.benchmark.command:benchmark",
         "Run methods on pairs with a known transform, from random starts; write tables and plots.",
     ),
+    "simulate": Verb(
+        "mtpcr_geo.benchmark.command:simulate",
+        "Simulate pairs of a ground and an aerial cloud with a known transform (extra: benchmark).",
+    ),
 }
 # typer offers this exception alone, whose base is every fault of a command line
 _UsageError: type[Exception] = typer.BadParameter.__bases__[0]

@@ -12,6 +12,7 @@ from mtpcr_geo.core import transforms
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from mtpcr_geo.pipeline.records import StageRecord
     from mtpcr_geo.pipeline.runner import RunResult
     from mtpcr_geo.registration import Registration
 
@@ -122,12 +123,12 @@ def _metric_rows(metrics: Mapping[str, Any], verbose: bool) -> list[tuple[str, s
     return metric_rows(metrics if verbose or not chosen else chosen)
 
 
-def _print_stages(done: Sequence[Mapping[str, Any]]) -> None:
+def _print_stages(done: Sequence[StageRecord]) -> None:
     """Print the seconds of each stage, on standard error."""
     from rich.console import Console
 
     talk = Console(stderr=True, highlight=False)
-    for entry in done:
-        note = entry.get("skipped") or entry.get("failed") or ""
-        text = f"  {entry['seconds']:8.2f} s  {entry['tag']} ({entry['type']}) {note}".rstrip()
+    for record in done:
+        note = record.skipped or record.failed or ""
+        text = f"  {record.seconds:8.2f} s  {record.tag} ({record.type}) {note}".rstrip()
         talk.print(text, soft_wrap=True, markup=False)

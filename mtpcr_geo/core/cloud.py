@@ -48,6 +48,11 @@ class Cloud(ABC):
     def table_chunks(self, size: int = CHUNK_POINTS) -> Iterator[PointTable]:
         """Yield tables of all dimensions by PDAL name (X, Y, Z in float64 first), n <= size rows each."""
 
+    def to_array(self) -> Floats:
+        """Return all (n, 3) float64 coordinates in the cloud's own CRS and units."""
+        chunks = list(self.xyz_chunks())
+        return np.concatenate(chunks) if chunks else np.empty((0, 3))
+
     def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, Mask]]:
         """Yield coordinates (n, 3) and which of them are noise or withheld (n,), n <= size.
 

@@ -9,11 +9,17 @@ from mtpcr_geo.core.errors import CrsError, InputError
 from mtpcr_geo.crs.facts import same_place
 from mtpcr_geo.export.transform import read_transform
 from mtpcr_geo.io.las import open_cloud
+from mtpcr_geo.io.memory import cloud_of, coordinates, is_array
 from mtpcr_geo.io.outputs import OutputSet
+from mtpcr_geo.io.views import Moved
 from mtpcr_geo.io.write import returning_scales, write_cloud
 
 if TYPE_CHECKING:
+    from mtpcr_geo.core.arrays import Floats
+    from mtpcr_geo.core.cloud import Cloud
     from mtpcr_geo.core.progress import Progress
+    from mtpcr_geo.crs.chain import TransformChain
+    from mtpcr_geo.io.memory import CloudLike
 
 
 def apply_transform(
@@ -46,26 +52,75 @@ def apply_transform(
 
     """
     chain = read_transform(transform_path)
-    start, end = (chain.target, chain.source) if inverse else (chain.source, chain.target)
     cloud = open_cloud(in_path)
     out_path = Path(out_path)
     if out_path.exists() and out_path.samefile(in_path):
         raise InputError(f"{out_path} is input and output at once; write to another file")
+    write_moved(out_path, moved_by(chain, cloud, inverse=inverse), overwrite=overwrite, progress=progress)
+    return out_path
+
+
+def move(chain: TransformChain, points: CloudLike, *, inverse: bool = False) -> Floats | Cloud:
+    """Move points by the chain of a registration: an array at once, a cloud as its points are read.
+
+    Args:
+        chain: from the source's coordinates to the target's.
+        points: (n, 3) coordinates in the source's CRS and units (in the target's with `inverse`); or a file,
+            `laspy.LasData` or `Cloud`.
+        inverse: go from target to source.
+
+    Returns:
+        (n, 3) float64 for an array, else a cloud with all dimensions.
+
+    Raises:
+        InputError: if the points are none.
+        CrsError: if a cloud is not in the frame from which the transform starts.
+
+    """
+    if is_array(points):
+        xyz = coordinates(points, "points")
+        return chain.inverse(xyz) if inverse else chain.forward(xyz)
+    return moved_by(chain, cloud_of(points, "points"), inverse=inverse)
+
+
+def moved_by(chain: TransformChain, cloud: Cloud, *, inverse: bool = False) -> Moved:
+    """Return a cloud moved by the chain of a registration; its points are moved as they are read.
+
+    Args:
+        chain: from the source's coordinates to the target's.
+        cloud: in the source's frame (in the target's with `inverse`).
+        inverse: go from target to source.
+
+    Raises:
+        CrsError: if the cloud is not in the frame from which the transform starts.
+
+    """
+    start, end = (chain.target, chain.source) if inverse else (chain.source, chain.target)
     if cloud.crs is not None and start.file_crs is not None and not same_place(cloud.crs, start.file_crs):
         side = "target" if inverse else "source"
         raise CrsError(
-            f"{in_path} is in {cloud.crs.name}, and the transform starts from its {side}'s "
+            f"{cloud.name} is in {cloud.crs.name}, and the transform starts from its {side}'s "
             f"{start.file_crs.name}; reproject the cloud first, or check whether --inverse is meant"
         )
+    return Moved(cloud, chain.inverse if inverse else chain.forward, end.file_crs)
+
+
+def write_moved(
+    out_path: str | Path, moved: Moved, *, overwrite: bool = False, progress: Progress | None = None
+) -> None:
+    """Stream a moved cloud into a new LAS, LAZ or COPC file, with digits fine enough to move it back.
+
+    Raises:
+        OutputError: if the output cannot be written, or exists.
+
+    """
     with OutputSet(overwrite) as outputs:
-        part = outputs.path(out_path)
         write_cloud(
-            part,
-            cloud,
-            chain.inverse if inverse else chain.forward,
-            end.file_crs,
-            scale=tuple(returning_scales(cloud, end.file_crs)),
+            outputs.path(out_path),
+            moved.base,
+            moved.move,
+            moved.crs,
+            scale=tuple(returning_scales(moved.base, moved.crs)),
             progress=progress,
         )
         outputs.commit()
-    return out_path

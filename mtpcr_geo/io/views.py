@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.crs import TransformChain
+
+if TYPE_CHECKING:
+    from pyproj import CRS
 
 Floats = NDArray[np.float64]
 Box = tuple[tuple[float, float], ...]
@@ -122,32 +125,29 @@ class Head(View):
 
 
 class Moved(Cloud):
-    """The source of a registration, brought to the target: in the target's CRS and units.
+    """A cloud whose points are moved as they are read, into another CRS and other units.
 
-    Points stream through the work frame, so that no digits are lost far from the origin. The bounds
-    enclose the cloud, and may be wider than it.
+    The bounds enclose the cloud, and may be wider than it.
 
-    Attributes:
-        base: the source cloud.
+    Args:
+        base: the cloud as it stands.
+        move: takes (n, 3) coordinates of `base` to the new ones.
+        crs: CRS of the new coordinates, or None for local ones.
 
     """
 
-    def __init__(self, pair: Pair) -> None:
-        self.base = pair.source.cloud
-        self._chain = TransformChain.of(pair)
-        self.name = self.base.name
-        self.crs = self._chain.target.file_crs
-        self.count = self.base.count
-        axes = np.stack([self.base.minimum, self.base.maximum], axis=1)
-        moved = self.move(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
+    def __init__(self, base: Cloud, move: Callable[[Floats], Floats], crs: CRS | None) -> None:
+        self.base = base
+        self.move = move
+        self.name = base.name
+        self.crs = crs
+        self.count = base.count
+        axes = np.stack([base.minimum, base.maximum], axis=1)
+        moved = move(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
         self.minimum, self.maximum = moved.min(axis=0), moved.max(axis=0)
 
-    def move(self, xyz: Floats) -> Floats:
-        """Take (n, 3) source file coordinates to (n, 3) target file coordinates."""
-        return self._chain.forward(xyz)
-
     def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
-        """Yield (n, 3) float64 coordinates in the target's CRS and units, n <= size."""
+        """Yield (n, 3) float64 moved coordinates, n <= size."""
         for xyz in self.base.xyz_chunks(size):
             yield self.move(xyz)
 
@@ -157,3 +157,21 @@ class Moved(Cloud):
             xyz = self.move(xyz_of(table))
             moved: PointTable = {axis: xyz[:, i] for i, axis in enumerate("XYZ")}
             yield {**table, **moved}
+
+    def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, NDArray[np.bool_]]]:
+        """Yield moved coordinates (n, 3) and which of them are noise or withheld (n,), n <= size."""
+        for xyz, noise in self.base.noise_chunks(size):
+            yield self.move(xyz), noise
+
+
+def moved_source(pair: Pair) -> Moved:
+    """Return the source of a solved pair, brought to the target: in the target's CRS and units.
+
+    Points stream through the work frame, so that no digits are lost far from the origin.
+
+    Raises:
+        ValueError: if the pair has no transform yet.
+
+    """
+    chain = TransformChain.of(pair)
+    return Moved(pair.source.cloud, chain.forward, chain.target.file_crs)

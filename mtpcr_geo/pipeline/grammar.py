@@ -49,7 +49,7 @@ _PDAL_WRITER_SUFFIXES = {
 
 @dataclass
 class Element:
-    """One element of the JSON: its words as written, before stages are linked.
+    """One element of the JSON as written, before stages are linked.
 
     Attributes:
         position: place in the pipeline, from 1.

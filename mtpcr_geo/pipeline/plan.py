@@ -4,48 +4,60 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pydantic import ValidationError
 
+from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import MissingPartError, OptionError
 from mtpcr_geo.pipeline import safety
 from mtpcr_geo.pipeline.grammar import StageSpec, file_of
 from mtpcr_geo.pipeline.pdal import library
 from mtpcr_geo.pipeline.registry import make_options, stage_types, unknown_type
-from mtpcr_geo.pipeline.stage import Stage
-
-if TYPE_CHECKING:
-    from mtpcr_geo.pipeline.runner import Settings
+from mtpcr_geo.pipeline.stage import Node, Stage
+from mtpcr_geo.pipeline.stages.memory import MemoryReader
 
 Kind = Literal["cloud", "pair"]
 _PDAL_FAMILIES = ("readers.", "filters.", "writers.")
 
 
-def plan(specs: Sequence[StageSpec], settings: Settings) -> dict[str, Stage]:
-    """Make the stages of a pipeline, by tag, in its order.
+def plan(
+    specs: Sequence[StageSpec],
+    *,
+    allow_code: bool = False,
+    allow_network: bool = False,
+    given: Mapping[str, Cloud] | None = None,
+) -> list[Node]:
+    """Make the stages of a pipeline, in its order.
+
+    Args:
+        specs: the linked pipeline.
+        allow_code, allow_network: let PDAL stages run code, or reach beyond this machine.
+        given: clouds in memory, by the tag of the reader that stands for each.
 
     Raises:
         OptionError: naming the stage and what is wrong with it.
         MissingPartError: if a stage needs PDAL and PDAL is not there.
 
     """
-    safety.check(specs, allow_code=settings.allow_code, allow_network=settings.allow_network)
-    own = stage_types()
-    by_pdal = served_by_pdal(specs)
+    given = given or {}
+    safety.check(specs, allow_code=allow_code, allow_network=allow_network)
+    by_pdal = served_by_pdal([spec for spec in specs if spec.tag not in given])
     stages: dict[str, Stage] = {}
     for spec in specs:
-        if spec.tag in by_pdal:
+        if spec.tag in given:
+            stages[spec.tag] = MemoryReader(given[spec.tag], spec.tag)
+        elif spec.tag in by_pdal:
             from mtpcr_geo.pipeline.pdal.stages import make_pdal_stage
 
             stages[spec.tag] = make_pdal_stage(spec)
         else:
-            kind = own[spec.type]
+            kind = stage_types()[spec.type]
             stages[spec.tag] = kind(make_options(spec.label, kind.Options, spec.options), spec.tag)
     _check_kinds(specs)
     if by_pdal:
         _connect(specs, stages)
-    return stages
+    return [Node(stages[spec.tag], spec.inputs, spec.options) for spec in specs]
 
 
 def served_by_pdal(specs: Sequence[StageSpec]) -> set[str]:
@@ -65,7 +77,7 @@ def served_by_pdal(specs: Sequence[StageSpec]) -> set[str]:
             edges = [(spec.tag, tag) for tag in spec.inputs]
             for edge in edges:
                 ends = [end for end in specs if end.tag in edge]
-                if sum(end.tag in by_pdal for end in ends) != 1:
+                if len(ends) < 2 or sum(end.tag in by_pdal for end in ends) != 1:
                     continue
                 other = next(end for end in ends if end.tag not in by_pdal)
                 if other.type.startswith(_PDAL_FAMILIES) and other.type in own and _pdal_has(other):
@@ -91,9 +103,9 @@ def _needs_pdal(spec: StageSpec) -> bool:
 
 
 def _we_can(spec: StageSpec) -> bool:
-    words = {key: value for key, value in spec.options.items() if key != "user_data"}
+    options = {key: value for key, value in spec.options.items() if key != "user_data"}
     try:
-        stage_types()[spec.type].Options.model_validate(words)
+        stage_types()[spec.type].Options.model_validate(options)
     except ValidationError:
         return False
     return spec.type.startswith("readers.") or len(spec.inputs) == 1
@@ -104,7 +116,7 @@ def _pdal_has(spec: StageSpec) -> bool:
 
 
 def _connect(specs: Sequence[StageSpec], stages: Mapping[str, Stage]) -> None:
-    """Return every PDAL stage what stands before it, and whether PDAL must run once it is reached."""
+    """Give every PDAL stage what stands before it, and whether PDAL must run once it is reached."""
     from mtpcr_geo.pipeline.pdal.stages import PdalStage
 
     files: dict[str, Path | None] = {}

@@ -1,4 +1,4 @@
-"""Which stages there are, and how one is made from its words in the JSON."""
+"""Which stages there are, and how one is made from its options in the JSON."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def unknown_type(label: str, kind: str, valid: list[str]) -> OptionError:
     return OptionError(f"{label}: there is no stage type {kind!r}{hint}")
 
 
-def make_options(label: str, model: type[StageOptions], words: Mapping[str, Any]) -> StageOptions:
+def make_options(label: str, model: type[StageOptions], written: Mapping[str, Any]) -> StageOptions:
     """Read a stage's options.
 
     Raises:
@@ -47,8 +47,8 @@ def make_options(label: str, model: type[StageOptions], words: Mapping[str, Any]
 
     """
     # PDAL lets every stage carry user_data, for the user's own use
-    words = {key: value for key, value in words.items() if key != "user_data"}
+    options = {key: value for key, value in written.items() if key != "user_data"}
     try:
-        return model.model_validate(words)
+        return model.model_validate(options)
     except ValidationError as error:
         raise OptionError(f"{label}: {first_problem(error, model)}") from None

@@ -1,14 +1,14 @@
-"""Runs linked stages in order: checks first, times and records each, puts outputs in place at the end."""
+"""Runs stages in order: checks first, times and records each, puts outputs in place at the end."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import closing
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
+from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError, RegistrationError
 from mtpcr_geo.core.progress import NoProgress, Progress
 from mtpcr_geo.core.system import versions
@@ -16,7 +16,8 @@ from mtpcr_geo.core.types import Pair, Verdict
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.pipeline.grammar import StageSpec
 from mtpcr_geo.pipeline.plan import plan
-from mtpcr_geo.pipeline.stage import RunContext, Stage, Value
+from mtpcr_geo.pipeline.records import RunFacts, StageRecord, input_files
+from mtpcr_geo.pipeline.stage import Node, RunContext, Stage, Value
 
 
 @dataclass(frozen=True)
@@ -25,17 +26,11 @@ class Settings:
 
     Attributes:
         overwrite: replace files that are already there.
-        seed: of everything random.
-        force: write the registered cloud though the verdict refuses it.
-        recording: whether recording stages record.
         allow_code, allow_network: let PDAL stages run code, or reach beyond this machine.
 
     """
 
     overwrite: bool = False
-    seed: int = 0
-    force: bool = False
-    recording: bool = True
     allow_code: bool = False
     allow_network: bool = False
 
@@ -46,17 +41,20 @@ class RunResult:
 
     Attributes:
         values: what each stage made, by tag; None where it was skipped.
-        done: one entry a stage (type, tag, options, seconds, metadata), in the order they ran.
+        done: the finished stages, in the order they ran.
         outputs: the files now in place.
         failure: why the registration had nothing to go on with, if so.
+        facts: what holds for the whole run.
+        seconds: wall time of the run.
 
     """
 
     values: Mapping[str, Value | None]
-    done: Sequence[Mapping[str, Any]]
+    done: Sequence[StageRecord]
     outputs: Sequence[Path]
     failure: str | None = None
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    facts: RunFacts = field(default_factory=RunFacts)
+    seconds: float = 0.0
 
     @property
     def pair(self) -> Pair | None:
@@ -73,97 +71,162 @@ class RunResult:
         return self.pair.verdict if self.pair else None
 
 
-def validate(specs: Sequence[StageSpec], settings: Settings = Settings()) -> None:
+def validate(
+    specs: Sequence[StageSpec],
+    settings: Settings = Settings(),
+    given: Mapping[str, Cloud] | None = None,
+) -> None:
     """Find everything wrong that can be known without running: options, files, kinds, CRS.
+
+    Headers are read, points are not.
+
+    Args:
+        specs: the linked pipeline.
+        settings: how it would be run.
+        given: clouds in memory, by the tag of the reader that stands for each.
 
     Raises:
         MtpcrError: the first thing found.
 
     """
-    stages = plan(specs, settings)
+    nodes = _planned(specs, settings, given)
     with OutputSet(settings.overwrite) as outputs:
-        context = _context(specs, outputs, NoProgress(), settings)
-        _check(stages, context)
-        _dry_run(specs, stages, context)
+        context = RunContext(outputs, NoProgress())
+        with closing(context):
+            _check(nodes, context)
+            _preview(nodes, context)
 
 
 def execute(
-    specs: Sequence[StageSpec], settings: Settings = Settings(), progress: Progress | None = None
+    specs: Sequence[StageSpec],
+    settings: Settings = Settings(),
+    progress: Progress | None = None,
+    given: Mapping[str, Cloud] | None = None,
 ) -> RunResult:
     """Run a pipeline whole, or leave nothing.
 
+    Args:
+        specs: the linked pipeline.
+        settings: how to run it.
+        progress: where long work reports.
+        given: clouds in memory, by the tag of the reader that stands for each.
+
     Raises:
         MtpcrError: whatever stopped it; a registration that fails is no such stop where the pipeline
-            keeps evidence: then the result says so.
+            keeps evidence: then the result has the reason.
 
     """
-    stages = plan(specs, settings)
-    inputs = _inputs_behind_late(specs, stages)
-    with OutputSet(settings.overwrite) as outputs:
-        context = _context(specs, outputs, progress or NoProgress(), settings)
+    nodes = _planned(specs, settings, given)
+    result = run(nodes, overwrite=settings.overwrite, progress=progress)
+    if result.failure is not None and not any(node.stage.evidence for node in nodes):
+        raise RegistrationError(result.failure)
+    return result
+
+
+def run(
+    nodes: Sequence[Node],
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    before: RunResult | None = None,
+) -> RunResult:
+    """Run stages in their order; their files come into place together at the end, or not at all.
+
+    Args:
+        nodes: stages, each with the tags that it takes from.
+        overwrite: replace files that are already there.
+        progress: where long work reports.
+        before: a run that these stages carry on; they may take from its stages.
+
+    Returns:
+        What was made. A registration that fails is refused, and no error.
+
+    Raises:
+        MtpcrError: whatever else stopped it.
+
+    """
+    stages = [node.stage for node in nodes]
+    inputs = _inputs_behind_late(nodes)
+    values: dict[str, Value | None] = dict(before.values) if before is not None else {}
+    with OutputSet(overwrite) as outputs:
+        context = RunContext(outputs, progress or NoProgress())
+        context.facts = _facts(nodes, before)
+        if before is not None:
+            context.done, context.failure = list(before.done), before.failure
         with closing(context):
-            _check(stages, context)
-            if any(stage.evidence for stage in stages.values()):
-                context.facts |= {"versions": versions(), "inputs": _input_facts(stages)}
-            for stage in stages.values():
+            _check(nodes, context)
+            if any(stage.evidence for stage in stages):
+                context.facts = replace(
+                    context.facts,
+                    versions=versions(),
+                    inputs=tuple(file.hashed() for file in context.facts.inputs),
+                )
+            for stage in stages:
                 stage.open(context)
-            context.recorder.begin(context.facts)
-            values: dict[str, Value | None] = {}
-            for spec in sorted(specs, key=lambda spec: stages[spec.tag].late):
-                stage = stages[spec.tag]
-                if stage.late:
+            context.recorder.begin(context.facts.audit())
+            for node in sorted(nodes, key=lambda node: node.stage.late):
+                if node.stage.late:
                     context.stop_recording()
-                values[spec.tag] = _turn(stage, [values[tag] for tag in inputs[spec.tag]], context)
-        if context.failure is not None and not any(stage.evidence for stage in stages.values()):
-            raise RegistrationError(context.failure)
-        written = outputs.commit()
-    return RunResult(values, context.done, written, context.failure, context.facts)
+                values[node.tag] = _turn(node.stage, [values[tag] for tag in inputs[node.tag]], context)
+        # a run that fails and keeps no evidence leaves nothing
+        keep = context.failure is None or any(stage.evidence for stage in stages)
+        written = outputs.commit() if keep else []
+    seconds = time.perf_counter() - context.facts.started
+    return RunResult(values, tuple(context.done), written, context.failure, context.facts, seconds)
 
 
-def _inputs_behind_late(
-    specs: Sequence[StageSpec], stages: Mapping[str, Stage]
-) -> dict[str, tuple[str, ...]]:
-    """Let what takes from a late stage take from before it: a late stage hands on what it was given."""
+def _planned(specs: Sequence[StageSpec], settings: Settings, given: Mapping[str, Cloud] | None) -> list[Node]:
+    return plan(specs, allow_code=settings.allow_code, allow_network=settings.allow_network, given=given)
+
+
+def _facts(nodes: Sequence[Node], before: RunResult | None) -> RunFacts:
+    written = tuple(node.audit() for node in nodes)
+    files = input_files(path for node in nodes for path in node.stage.reads())
+    now = time.perf_counter()
+    if before is None:
+        return RunFacts(pipeline=written, started=now, inputs=files)
+    # the time in between does not count
+    known = before.facts
+    return replace(
+        known,
+        pipeline=known.pipeline + written,
+        started=now - before.seconds,
+        inputs=known.inputs + files,
+    )
+
+
+def _inputs_behind_late(nodes: Sequence[Node]) -> dict[str, tuple[str, ...]]:
+    """Return each stage's inputs, where a late stage is replaced by its own: it returns what it took."""
+    late = {node.tag for node in nodes if node.stage.late}
     inputs: dict[str, tuple[str, ...]] = {}
-    for spec in specs:
+    for node in nodes:
         found: tuple[str, ...] = ()
-        for tag in spec.inputs:
-            found += inputs[tag] if stages[tag].late else (tag,)
-        inputs[spec.tag] = found
+        for tag in node.inputs:
+            found += inputs[tag] if tag in late else (tag,)
+        inputs[node.tag] = found
     return inputs
 
 
-def _context(
-    specs: Sequence[StageSpec], outputs: OutputSet, progress: Progress, settings: Settings
-) -> RunContext:
-    context = RunContext(outputs, progress, seed=settings.seed, force=settings.force)
-    context.facts = {
-        "pipeline": [
-            {"type": spec.type, "tag": spec.tag, **({"inputs": list(spec.inputs)} if spec.inputs else {})}
-            | dict(spec.options)
-            for spec in specs
-        ],
-        "started": time.perf_counter(),
-        "recording": settings.recording,
-    }
-    return context
-
-
-def _check(stages: Mapping[str, Stage], context: RunContext) -> None:
+def _check(nodes: Sequence[Node], context: RunContext) -> None:
     writers: dict[Path, Stage] = {}
-    for stage in stages.values():
+    stages = [node.stage for node in nodes]
+    for stage in stages:
         for path in stage.writes():
             other = writers.setdefault(path.resolve(), stage)
             if other is not stage:
                 raise OptionError(
                     f"{stage.label} and {other.label} both write {path}; give each its own file"
                 )
-    for stage in stages.values():
+    for stage in stages:
         for path in stage.reads():
             if path.resolve() in writers:
                 writer = writers[path.resolve()]
                 raise OptionError(f"{writer.label} would write over {path}, which {stage.label} reads")
-    for stage in stages.values():
+    for file in context.facts.inputs:
+        if file.path.resolve() in writers:
+            writer = writers[file.path.resolve()]
+            raise OptionError(f"{writer.label} would write over {file.path}, which the run has read")
+    for stage in stages:
         for path in stage.reads():
             if not path.exists():
                 raise InputError(f"{stage.label}: there is no file {path}")
@@ -172,50 +235,46 @@ def _check(stages: Mapping[str, Stage], context: RunContext) -> None:
         stage.check(context)
 
 
-def _dry_run(specs: Sequence[StageSpec], stages: Mapping[str, Stage], context: RunContext) -> None:
-    """Open what readers name, and let every stage look at the inputs that are known by then."""
+def _preview(nodes: Sequence[Node], context: RunContext) -> None:
+    """Let every stage check the inputs that are known from headers."""
     values: dict[str, Value] = {}
-    for spec in specs:
-        stage = stages[spec.tag]
-        inputs = [values[tag] for tag in spec.inputs if tag in values]
-        if len(inputs) == len(spec.inputs):
-            stage.check_inputs(inputs, context)
-            if not spec.inputs and not stage.writes():
-                made = stage.run([], context)
-                if made is not None:
-                    values[spec.tag] = made
+    for node in nodes:
+        inputs = [values[tag] for tag in node.inputs if tag in values]
+        if len(inputs) == len(node.inputs):
+            node.stage.check_inputs(inputs, context)
+        if not node.inputs:
+            made = node.stage.preview(context)
+            if made is not None:
+                values[node.tag] = made
 
 
 def _turn(stage: Stage, inputs: Sequence[Value | None], context: RunContext) -> Value | None:
-    """Run one stage, or say why it is skipped, and note it."""
+    """Run one stage, or skip it, and put it on record."""
     start = time.perf_counter()
-    entry: dict[str, Any] = {"type": stage.type, "tag": stage.tag}
-    entry["options"] = stage.options.model_dump(mode="json")
+    skipped = failed = None
     value: Value | None = None
     if not stage.evidence and (context.failure is not None or None in inputs):
-        entry["skipped"] = "the registration was refused before"
+        skipped = "the registration was refused before"
         value = next((given for given in inputs if isinstance(given, Pair)), None)
     else:
         try:
-            value = stage.run([given for given in inputs if given is not None], context)
+            with _memory_errors(stage):
+                value = stage.run([given for given in inputs if given is not None], context)
         except RegistrationError as error:
-            context.failure = str(error)
-            entry["failed"] = str(error)
+            context.failure = failed = str(error)
             pair = next((given for given in inputs if isinstance(given, Pair)), None)
-            value = pair and pair.with_(verdict=Verdict("refused", (str(error),), {}))
-        except MemoryError as error:
-            raise MtpcrError(
-                f"{stage.label}: not enough memory; use a larger cell or thinner clouds"
-            ) from error
+            value = pair and pair.with_(verdict=Verdict("refused", (failed,), {}))
+    options = stage.options.model_dump(mode="json")
     seconds = time.perf_counter() - start
-    entry |= {"seconds": seconds, "metadata": stage.metadata}
-    context.done.append(entry)
-    context.recorder.after(stage.type, stage.tag, entry["options"], value, seconds)
+    record = StageRecord(stage.type, stage.tag, options, seconds, stage.metadata, skipped, failed)
+    context.done.append(record)
+    context.recorder.after(stage.type, stage.tag, options, value, seconds)
     return value
 
 
-def _input_facts(stages: Mapping[str, Stage]) -> list[dict[str, Any]]:
-    from mtpcr_geo.core.system import sha256
-
-    paths = dict.fromkeys(path for stage in stages.values() for path in stage.reads() if path.is_file())
-    return [{"path": str(path), "bytes": path.stat().st_size, "sha256": sha256(path)} for path in paths]
+@contextmanager
+def _memory_errors(stage: Stage) -> Iterator[None]:
+    try:
+        yield
+    except MemoryError as error:
+        raise MtpcrError(f"{stage.label}: not enough memory; use a larger cell or thinner clouds") from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -17,6 +17,7 @@ from mtpcr_geo.core.progress import Progress as Progress
 from mtpcr_geo.core.recorder import NullRecorder, Recorder
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.io.outputs import OutputSet
+from mtpcr_geo.pipeline.records import RunFacts, StageRecord
 
 Value = Cloud | Pair
 
@@ -31,6 +32,27 @@ OptionsModel = type[StageOptions]
 
 
 @dataclass
+class Spool:
+    """Temporary files of clouds that were handed to PDAL, so that each is written once.
+
+    The clouds are held as long as the spool: one that is gone could pass its identity on to another.
+    """
+
+    _files: list[tuple[Cloud, Path]] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def path_of(self, cloud: Cloud) -> Path | None:
+        """Return the file of this very cloud, or None where it has none yet."""
+        return next((path for held, path in self._files if held is cloud), None)
+
+    def add(self, cloud: Cloud, path: Path) -> None:
+        """Note that a cloud has been written to a file."""
+        self._files.append((cloud, path))
+
+
+@dataclass
 class RunContext:
     """What every stage of one run shares.
 
@@ -38,34 +60,30 @@ class RunContext:
         outputs: where files are written until the run is whole.
         progress: where long work reports.
         recorder: the audit; a no-op twin when nobody wants a recording.
-        seed: of everything random.
-        force: write the registered cloud though the verdict refuses it.
-        done: one entry a finished stage (type, tag, options, seconds, metadata), in order.
-        facts: what holds for the whole run: the pipeline, versions, input files and their hashes.
+        done: the finished stages, in order.
+        facts: what holds for the whole run.
         failure: why the registration has nothing to go on with, once a stage said so.
-        spooled: passing files of clouds that were handed to PDAL, by the cloud's id.
+        spool: temporary files of clouds that were handed to PDAL.
 
     """
 
     outputs: OutputSet
     progress: Progress
     recorder: Recorder = field(default_factory=NullRecorder)
-    seed: int = 0
-    force: bool = False
-    done: list[dict[str, Any]] = field(default_factory=list)
-    facts: dict[str, Any] = field(default_factory=dict)
+    done: list[StageRecord] = field(default_factory=list)
+    facts: RunFacts = field(default_factory=RunFacts)
     failure: str | None = None
-    spooled: dict[int, Path] = field(default_factory=dict)
+    spool: Spool = field(default_factory=Spool)
     _scratch: tempfile.TemporaryDirectory[str] | None = None
 
     def scratch(self) -> Path:
-        """Return a folder for passing files, gone when the run ends."""
+        """Return a folder for temporary files, gone when the run ends."""
         if self._scratch is None:
             self._scratch = tempfile.TemporaryDirectory(prefix="mtpcr-geo-")
         return Path(self._scratch.name)
 
     def close(self) -> None:
-        """Remove passing files, and finish the recording."""
+        """Remove temporary files, and finish the recording."""
         if self._scratch is not None:
             self._scratch.cleanup()
             self._scratch = None
@@ -85,7 +103,7 @@ class Stage(ABC):
         Options: the pydantic model of its options.
         evidence: whether it still runs, with what there is, when the registration failed or was refused;
             its inputs may then hold None.
-        late: whether it runs after all others, since it tells about the whole run.
+        late: whether it runs after all others, since it reports on the whole run.
 
     """
 
@@ -131,9 +149,19 @@ class Stage(ABC):
         """How messages name it."""
         return f"stage {self.tag} ({self.type})"
 
+    def preview(self, context: RunContext) -> Value | None:
+        """Return what a stage without inputs will make, as far as headers tell; no point is read.
+
+        None where only running tells.
+        """
+        return None
+
     @abstractmethod
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
-        """Do the work. Writers hand on what they were given; None means nothing goes on from here."""
+        """Do the work, and return what the next stages take; None where nothing goes on from here.
+
+        Writers return what they took.
+        """
 
     def one_pair(self, inputs: Sequence[Value]) -> Pair:
         """Take the single registration state among the inputs.
@@ -148,6 +176,48 @@ class Stage(ABC):
             f"stage {self.tag} ({self.type}) needs a pair of clouds from mtpcr.level or a later mtpcr stage, "
             f"and got {_describe(inputs)}; set its inputs"
         )
+
+
+@dataclass(frozen=True)
+class Node:
+    """A stage in its place in a pipeline.
+
+    Attributes:
+        stage: what runs.
+        inputs: tags of the stages that it takes from, all before it.
+        written: its options as written, for the audit.
+
+    """
+
+    stage: Stage
+    inputs: tuple[str, ...] = ()
+    written: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def tag(self) -> str:
+        """The stage's name in the pipeline."""
+        return self.stage.tag
+
+    def audit(self) -> dict[str, Any]:
+        """Return the stage as pipeline JSON has it, its inputs by name."""
+        inputs = {"inputs": list(self.inputs)} if self.inputs else {}
+        return {"type": self.stage.type, "tag": self.tag, **inputs, **self.written}
+
+
+def chained(stages: Sequence[Stage], first_inputs: tuple[str, ...] = ()) -> list[Node]:
+    """Put stages one behind the other: each takes from the one before.
+
+    Args:
+        stages: in the order of the run.
+        first_inputs: tags that the first one takes from.
+
+    """
+    nodes: list[Node] = []
+    for stage in stages:
+        inputs = (nodes[-1].tag,) if nodes else first_inputs
+        # options at their default are left out, as in pipelines written by hand
+        nodes.append(Node(stage, inputs, stage.options.model_dump(mode="json", exclude_defaults=True)))
+    return nodes
 
 
 def _describe(inputs: Sequence[Value]) -> str:

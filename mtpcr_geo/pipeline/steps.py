@@ -1,121 +1,208 @@
-"""Which stages a registration is made of, from levelling to verdict: ours, or MT-PCR's as published."""
+"""Which stages a registration is made of: readers, the method (ours, or MT-PCR's as published), writers."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.pipeline.options import MethodOptions
+from mtpcr_geo.io.memory import cloud_of
+from mtpcr_geo.pipeline.options import OUTPUT_NAMES, MethodOptions
+from mtpcr_geo.pipeline.stage import Stage
+from mtpcr_geo.pipeline.stages.export import (
+    Apply,
+    ApplyOptions,
+    BevFileOptions,
+    FileOptions,
+    TransformFileOptions,
+    WriteBev,
+    WriteRecording,
+    WriteReport,
+    WriteRun,
+    WriteTiePoints,
+    WriteTransform,
+)
+from mtpcr_geo.pipeline.stages.io import (
+    CopcReader,
+    CopcReaderOptions,
+    LasReader,
+    LasReaderOptions,
+    LasWriter,
+    LasWriterOptions,
+)
+from mtpcr_geo.pipeline.stages.matching import (
+    Enhance,
+    EnhanceOptions,
+    Focus,
+    FocusOptions,
+    Match,
+    MatchOptions,
+)
+from mtpcr_geo.pipeline.stages.memory import MemoryReader, SavedRecording
+from mtpcr_geo.pipeline.stages.rasters import BevOptions, Level, LevelOptions, MakeBev
+from mtpcr_geo.pipeline.stages.solving import (
+    Assess,
+    AssessOptions,
+    InverseMapping,
+    InverseMappingOptions,
+    Refine,
+    RefineOptions,
+    Solve,
+    SolveOptions,
+)
+
+if TYPE_CHECKING:
+    from mtpcr_geo.io.memory import CloudLike
 
 MANY_TRIES = 20_000
 """Pairs of tie points tried for the robust start with keypoint matchers: few matches may be right."""
-SWITCHES = ("force", "local")
-"""Options that are off unless named."""
+FINEST_OF_LEARNED_M = 0.5
+"""Finest cell chosen for learned keypoints, which like fine detail where the points are dense enough."""
 
 
-def steps_of(options: MethodOptions, inputs: Sequence[str] | None = None) -> list[dict[str, Any]]:
-    """Name the stages, as pipeline JSON, each tagged by its step.
+def steps_of(options: MethodOptions, prefix: str = "") -> list[Stage]:
+    """Make the stages from levelling to verdict, each tagged by its step.
 
     Args:
         options: of the method.
-        inputs: tags of the target's and the source's reader; the stages before, if None.
+        prefix: what the tags begin with.
 
     Raises:
         OptionError: if options do not go together.
 
     """
-    seed = {"seed": options.seed} if options.seed else {}
     paper = options.profile == "paper"
-    level = {
-        "type": "mtpcr.level",
-        "tag": "level",
-        "inputs": None if inputs is None else list(inputs),
-        "method": "ransac" if paper and options.level == "auto" else options.level,
-        "target_crs": options.target_crs,
-        "source_crs": options.source_crs,
-        "local": options.local,
-        "vertical": None if options.vertical == "refuse" else options.vertical,
-        "out_crs": options.out_crs,
-        **seed,
-    }
-    steps = [level, *(_paper_method(options, seed) if paper else _method(options, seed))]
-    return [without_defaults(step) for step in steps]
+    level = LevelOptions(
+        method="ransac" if paper and options.level == "auto" else options.level,
+        target_crs=options.target_crs,
+        source_crs=options.source_crs,
+        local=options.local,
+        vertical=options.vertical,
+        out_crs=options.out_crs,
+        seed=options.seed,
+    )
+    first = Level(level, f"{prefix}level")
+    return [first, *(_paper_method(options, prefix) if paper else _method(options, prefix))]
 
 
-def without_defaults(stage: dict[str, Any]) -> dict[str, Any]:
-    """Leave out what says nothing: None, and switches that are off."""
-    return {
-        key: value
-        for key, value in stage.items()
-        if value is not None and not (key in SWITCHES and value is False)
-    }
-
-
-def _method(options: MethodOptions, seed: dict[str, int]) -> list[dict[str, Any]]:
-    """Name the steps from raster to verdict."""
-    for name in ("res", "focus", "enhance"):
-        if not getattr(options, name):
+def _method(options: MethodOptions, prefix: str) -> list[Stage]:
+    """Make the steps from raster to verdict."""
+    for name, wanted in (("res", options.res), ("focus", options.focus), ("enhance", options.enhance)):
+        if not wanted:
             raise OptionError(f"--no-{name} belongs to --profile paper")
-    correlation = options.matcher in (None, "correlation")
-    match = {} if correlation else {"method": options.matcher, "models": _models(options)}
-    # learned keypoints like fine detail, where the points are dense enough to show it
-    finest = None if correlation or options.matcher in ("rootsift", "orb") else 0.5
+    seed = options.seed
+    matcher = options.matcher or "correlation"
+    by_keypoints = matcher != "correlation"
+    learned = by_keypoints and matcher not in ("rootsift", "orb")
+    bev = (
+        BevOptions(cell=options.cell, finest=FINEST_OF_LEARNED_M)
+        if learned
+        else BevOptions(cell=options.cell)
+    )
+    solve = SolveOptions(tries=MANY_TRIES, seed=seed) if by_keypoints else SolveOptions(seed=seed)
     return [
-        {"type": "mtpcr.bev", "tag": "bev", "cell": options.cell, "finest": finest},
-        {"type": "mtpcr.match", "tag": "match", **match, **_prior(options), **seed},
-        {"type": "mtpcr.inverse_mapping", "tag": "inverse_mapping", **seed},
-        {"type": "mtpcr.solve", "tag": "solve", "tries": None if correlation else MANY_TRIES, **seed},
-        {
-            "type": "mtpcr.refine",
-            "tag": "refine",
-            "motion": None if options.motion == "rigid" else options.motion,
-        },
-        {"type": "mtpcr.assess", "tag": "assess"},
+        MakeBev(bev, f"{prefix}bev"),
+        Match(_match_options(options, matcher), f"{prefix}match"),
+        InverseMapping(InverseMappingOptions(seed=seed), f"{prefix}inverse_mapping"),
+        Solve(solve, f"{prefix}solve"),
+        Refine(RefineOptions(motion=options.motion), f"{prefix}refine"),
+        Assess(AssessOptions(), f"{prefix}assess"),
     ]
 
 
-def _paper_method(options: MethodOptions, seed: dict[str, int]) -> list[dict[str, Any]]:
-    """Name the steps from raster to verdict as MT-PCR has them."""
+def _match_options(options: MethodOptions, matcher: str) -> MatchOptions:
+    models = None if matcher == "correlation" else options.models
+    if options.prior == "none":
+        return MatchOptions(method=matcher, models=models, seed=options.seed)
+    return MatchOptions(
+        method=matcher,
+        models=models,
+        prior=options.prior,
+        prior_sigma=options.prior_sigma,
+        prior_yaw=options.prior_yaw,
+        seed=options.seed,
+    )
+
+
+def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
+    """Make the steps from raster to verdict as MT-PCR has them."""
     if options.prior != "none" or options.motion != "rigid":
         raise OptionError("--prior and --motion are not of the paper; leave them out, or --profile paper")
+    seed = options.seed
     # without RES coordinates stay metres, and Eq. 2 makes pixels of one
-    res = {"cell": options.cell, "resolution": "eq1"} if options.res else {"cell": options.cell or 1.0}
-    matcher = options.matcher or "superpoint"
-    steps: list[dict[str, Any]] = [
-        {"type": "mtpcr.bev", "tag": "bev", **res, "pixel": "ceil"},
-        {"type": "mtpcr.enhance", "tag": "enhance", "look": "paper" if options.enhance else "grey"},
-        {"type": "mtpcr.match", "tag": "match", "method": matcher, "models": _models(options), **seed},
+    bev = (
+        BevOptions(cell=options.cell, resolution="eq1", pixel="ceil")
+        if options.res
+        else BevOptions(cell=options.cell or 1.0, pixel="ceil")
+    )
+    match = MatchOptions(method=options.matcher or "superpoint", models=options.models, seed=seed)
+    refine = RefineOptions(
+        method="point_to_point",
+        ground=False,
+        max_correspondence_distance=[3.0, 1.5, 0.75],
+        keep_tie_points=0,
+    )
+    steps: list[Stage] = [
+        MakeBev(bev, f"{prefix}bev"),
+        Enhance(EnhanceOptions(look="paper" if options.enhance else "grey"), f"{prefix}enhance"),
+        Match(match, f"{prefix}match"),
     ]
     if options.focus:
-        steps.append({"type": "mtpcr.focus", "tag": "focus", **seed})
+        steps.append(Focus(FocusOptions(seed=seed), f"{prefix}focus"))
+    lift = InverseMappingOptions(surface="grey", pixel="ceil", seed=seed)
     return [
         *steps,
-        {
-            "type": "mtpcr.inverse_mapping",
-            "tag": "inverse_mapping",
-            "surface": "grey",
-            "pixel": "ceil",
-            **seed,
-        },
-        {"type": "mtpcr.solve", "tag": "solve", "upright": False, "robust_start": False, **seed},
-        {
-            "type": "mtpcr.refine",
-            "tag": "refine",
-            "method": "point_to_point",
-            "ground": False,
-            "max_correspondence_distance": [3.0, 1.5, 0.75],
-            "keep_tie_points": 0,
-        },
-        {"type": "mtpcr.assess", "tag": "assess"},
+        InverseMapping(lift, f"{prefix}inverse_mapping"),
+        Solve(SolveOptions(upright=False, robust_start=False, seed=seed), f"{prefix}solve"),
+        Refine(refine, f"{prefix}refine"),
+        Assess(AssessOptions(), f"{prefix}assess"),
     ]
 
 
-def _models(options: MethodOptions) -> str | None:
-    return None if options.models is None else str(options.models)
+def reader_of(cloud: CloudLike, tag: str) -> Stage:
+    """Make the stage that reads a file, or returns a cloud in memory."""
+    if not isinstance(cloud, str | os.PathLike):
+        return MemoryReader(cloud_of(cloud, tag), tag)
+    path = Path(cloud)
+    if path.name.lower().endswith(".copc.laz"):
+        return CopcReader(CopcReaderOptions(filename=path), tag)
+    return LasReader(LasReaderOptions(filename=path), tag)
 
 
-def _prior(options: MethodOptions) -> dict[str, Any]:
-    if options.prior == "none":
-        return {}
-    return {"prior": options.prior, "prior_sigma": options.prior_sigma, "prior_yaw": options.prior_yaw}
+def recording_writer(folder: Path) -> Stage:
+    """Make the stage that records the run into a folder."""
+    return WriteRecording(FileOptions(filename=folder / OUTPUT_NAMES["recording"]), "recording")
+
+
+def writers_of(
+    folder: Path, *, force: bool, recorded: bool = False, recording: Path | None = None
+) -> list[Stage]:
+    """Make the stages behind the verdict that leave files.
+
+    Args:
+        folder: where the files go.
+        force: write cloud and transform though the verdict is refused.
+        recorded: record the run.
+        recording: a recording of it that is there already.
+
+    """
+    where = {name: folder / file for name, file in OUTPUT_NAMES.items()}
+    stages: list[Stage] = [
+        WriteBev(BevFileOptions(filename=where["bev"]), "rasters"),
+        WriteTiePoints(FileOptions(filename=where["tie_points"]), "tie_points"),
+    ]
+    for tag in ("transform", "matrix", "pdal"):
+        options = TransformFileOptions(filename=where[tag], force=force)
+        stages.append(WriteTransform(options, tag))
+    if recorded:
+        stages.append(recording_writer(folder))
+    if recording is not None:
+        stages.append(SavedRecording(recording, where["recording"], "recording"))
+    return [
+        *stages,
+        WriteReport(FileOptions(filename=where["report"]), "report"),
+        WriteRun(FileOptions(filename=where["run"]), "run"),
+        Apply(ApplyOptions(force=force), "moved"),
+        LasWriter(LasWriterOptions(filename=where["registered"]), "registered"),
+    ]

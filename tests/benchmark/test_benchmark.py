@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 
 from mtpcr_geo.benchmark import methods, pairs, published, standins, tables
 from mtpcr_geo.benchmark.baselines import external, fpfh
+from mtpcr_geo.benchmark.baselines.open3d import import_open3d
+from mtpcr_geo.benchmark.pairs import write_laz
 from mtpcr_geo.benchmark.plots import binned, cumulative
 from mtpcr_geo.benchmark.protocol import RUNS, read_rows, run_protocol
-from mtpcr_geo.benchmark.runs import Wanted, run_benchmark
-from mtpcr_geo.benchmark.simulator.pairs import write_laz
-from mtpcr_geo.benchmark.simulator.raycast import import_open3d
+from mtpcr_geo.benchmark.runs import PairSelection, run_benchmark
 from mtpcr_geo.benchmark.worker import StartRange
 from mtpcr_geo.cli.app import app
 from mtpcr_geo.core import transforms
@@ -59,7 +59,7 @@ def clouds():
 def test_protocol_runs_judges_and_resumes(data, tmp_path):
     folders = pairs.pair_folders(data)
     assert [folder.name for folder in folders] == ["A03-G05", "other"]
-    method = "icp:voxel=0.5,reach=3"
+    method = "icp:voxel=0.5,max_correspondence_distance=3"
     first = run_protocol(folders[:1], [method], tmp_path, starts=1, ranges=NEAR)
     rows = run_protocol(folders, [method], tmp_path, starts=2, ranges=NEAR, jobs=2)
     assert [(r["pair"], r["start"]) for r in rows[:1]] == [("A03-G05", 0)]
@@ -181,7 +181,7 @@ def test_ours_answers_with_a_verdict(clouds):
     ["fpfh-ransac:voxel=2,iterations=50000", "fpfh-fgr:voxel=2", "fpfh-svd:voxel=2", "fpfh-gnc:voxel=2"]
     + ["kiss-matcher:voxel=1.5"],
 )
-def test_rivals_register_an_easy_pair(spec, clouds, capfd):
+def test_baselines_register_an_easy_pair(spec, clouds, capfd):
     if "gnc" in spec or "kiss" in spec:
         pytest.importorskip("kiss_matcher", reason="kiss-matcher is not installed (extra benchmark)")
     source, target, T_true = clouds
@@ -390,9 +390,9 @@ def test_stand_in_has_the_papers_overlap_and_is_kept(tmp_path):
     assert len(chosen) == 14
     assert chosen["A04-G01"].given
     assert not chosen["A02-G05"].given
-    assert chosen["A02-G05"].scene.overlap_source_pct == pytest.approx(16.96)
+    assert chosen["A02-G05"].extent_and_overlap.overlap_source_pct == pytest.approx(16.96)
     small = standins.StandIn(
-        published.Combination("A03", "G05"), published.Scene(150, 150, 30, 20, 25), True, "suburb", 3
+        published.Combination("A03", "G05"), published.Extent(150, 150, 30, 20, 25), True, "suburb", 3
     )
     place = standins.write_stand_in(tmp_path, small, density=0.05)
     facts = json.loads((place / "pair.json").read_text())
@@ -408,7 +408,7 @@ def test_stand_in_has_the_papers_overlap_and_is_kept(tmp_path):
 @pytest.mark.parametrize("pair", [("G04", "G05"), ("A01", "A02")])
 def test_stand_ins_of_two_alike(pair):
     combination = published.Combination(*pair)
-    small = standins.StandIn(combination, published.Scene(150, 150, 30, 40, 60), True, "suburb", 3)
+    small = standins.StandIn(combination, published.Extent(150, 150, 30, 40, 60), True, "suburb", 3)
     made = standins.simulate_stand_in(small, density=0.05)
     moved = transforms.apply(made.T_target_source, made.source.xyz)
     assert np.abs(np.median(moved[:, 2]) - np.median(made.target.xyz[:, 2])) < 5.0
@@ -418,8 +418,8 @@ def test_stand_ins_of_two_alike(pair):
 
 def test_benchmark_leaves_tables_and_plots(data, tmp_path):
     pytest.importorskip("matplotlib", reason="matplotlib is not installed (extra benchmark)")
-    wanted = Wanted(data=(data,), only=("A03-G05",))
-    run_benchmark(wanted, ["icp"], tmp_path, starts=2, ranges=NEAR)
+    selection = PairSelection(data=(data,), only=("A03-G05",))
+    run_benchmark(selection, ["icp"], tmp_path, starts=2, ranges=NEAR)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {
         "runs.jsonl", "methods.log", "runs.csv", "protocol.json", "methods.csv", "pairs.csv", "results.json",
@@ -434,11 +434,11 @@ def test_benchmark_leaves_tables_and_plots(data, tmp_path):
 
 def test_verb_prints_what_it_found_and_says_what_is_wrong(data, tmp_path):
     out = ["benchmark", "--out", str(tmp_path / "out")]
-    said = CliRunner().invoke(
+    result = CliRunner().invoke(
         app, [*out, "--data", str(data), "--only", "other", "-m", "icp", "--starts", "1"]
     )
-    assert said.exit_code == 0, said.output
-    assert "| icp | 1 | 1 |" in said.output
+    assert result.exit_code == 0, result.output
+    assert "| icp | 1 | 1 |" in result.output
     assert CliRunner().invoke(app, out).exit_code == 2
     assert CliRunner().invoke(app, [*out, "--data", str(data), "-m", "none"]).exit_code == 2
     assert CliRunner().invoke(app, [*out, "--data", str(tmp_path)]).exit_code == 5

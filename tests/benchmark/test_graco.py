@@ -121,13 +121,13 @@ def test_bag_comes_out_as_the_cloud_it_was_made_from(tmp_path, version, name, T_
     write_bag(tmp_path / (f"{name}.bag" if version == 1 else name), version, scans)
     short = name[0].upper() + name[-2:]
     bag = graco.find_sequence(tmp_path, short)
-    cloud = graco.read_sequence(bag, T_imu_lidar, voxel_m=0.0, reach_m=(0.0, 200.0))
+    cloud = graco.read_sequence(bag, T_imu_lidar, voxel_m=0.0, range_m=(0.0, 200.0))
     assert cloud.shape == world.shape
     assert np.linalg.norm(cloud - world, axis=1).max() < 0.01
     # without the times of single points it would be off by decimetres
     still = [(stamp, xyz, np.zeros_like(relative)) for stamp, xyz, relative in scans]
     write_bag(tmp_path / "skewed.bag", 1, still)
-    skewed = graco.read_sequence(tmp_path / "skewed.bag", T_imu_lidar, voxel_m=0.0, reach_m=(0.0, 200.0))
+    skewed = graco.read_sequence(tmp_path / "skewed.bag", T_imu_lidar, voxel_m=0.0, range_m=(0.0, 200.0))
     assert np.linalg.norm(skewed - world, axis=1).max() > 0.5
 
 
@@ -137,7 +137,7 @@ def test_thinning_keeps_a_point_a_voxel_and_far_points_go(tmp_path):
     full = graco.read_sequence(tmp_path / "aerial-01.bag", TIPPED, voxel_m=0.0)
     thin = graco.read_sequence(tmp_path / "aerial-01.bag", TIPPED, voxel_m=5.0)
     assert len(thin) == len(np.unique(np.floor(full / 5.0), axis=0))
-    near = graco.read_sequence(tmp_path / "aerial-01.bag", TIPPED, voxel_m=0.0, reach_m=(1.0, 45.0))
+    near = graco.read_sequence(tmp_path / "aerial-01.bag", TIPPED, voxel_m=0.0, range_m=(1.0, 45.0))
     assert 0 < len(near) < len(full)
     half = graco.read_sequence(tmp_path / "aerial-01.bag", TIPPED, voxel_m=0.0, every=2)
     assert len(half) == pytest.approx(len(full) / 2, rel=0.05)

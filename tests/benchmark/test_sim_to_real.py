@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 
+from mtpcr_geo.benchmark.pairs import write_laz
 from mtpcr_geo.benchmark.sim_to_real import cloud_figures, compare, margins
-from mtpcr_geo.benchmark.simulator.pairs import write_laz
 from mtpcr_geo.core.cloud import ArrayCloud
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mtpcr_geo.benchmark import metrics
+from mtpcr_geo.benchmark.baselines.open3d import import_open3d
 from mtpcr_geo.benchmark.simulator import instruments
 from mtpcr_geo.benchmark.simulator.buildings import Building, add_building
 from mtpcr_geo.benchmark.simulator.mesh import Frame, Material, MeshBuilder
@@ -20,7 +21,7 @@ from mtpcr_geo.benchmark.simulator.site import make_site
 from mtpcr_geo.benchmark.simulator.terrain import relief
 from mtpcr_geo.benchmark.simulator.vegetation import Plants, Species
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.errors import OptionError, OutputError
+from mtpcr_geo.core.errors import MissingPartError, OptionError, OutputError
 
 SMALL: dict[str, Any] = {
     "extent_m": 160.0,
@@ -312,9 +313,66 @@ def test_another_epoch_keeps_the_stems():
     assert later.height.mean() == pytest.approx(10.5, rel=0.01)
 
 
-def test_open3d_is_not_loaded_by_import():
+def test_ray_casting_is_not_loaded_by_import():
     code = (
-        "import sys, mtpcr_geo.benchmark.simulator.pairs, mtpcr_geo.cli.demo; print('open3d' in sys.modules)"
+        "import sys, mtpcr_geo.benchmark.simulator.pairs, mtpcr_geo.benchmark.command; "
+        "print({'open3d', 'embreex'} & set(sys.modules))"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == "False"
+    assert out.stdout.strip() == "set()"
+
+
+def test_missing_ray_casting_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "embreex", None)
+    with pytest.raises(MissingPartError, match=r"mtpcr-geo\[benchmark\]"):
+        simulate_pair("town", 0, **SMALL)
+
+
+def test_rays_meet_what_they_meet_by_hand():
+    out = MeshBuilder()
+    out.polygons(sheet(2.0, 0, 10.0), Material.ASPHALT)
+    out.polygons(sheet(5.0, 0, 1.0), Material.ROOF)
+    slope = np.array([0.6, 0.0, -0.8])
+    origins = np.array([[0.0, 0.0, 9.0], [5.0, 5.0, 9.0], [0.0, 0.0, 9.0], [-5.0, 0.0, 10.0]])
+    directions = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0], slope])
+    hits = Caster(out.build()).cast(origins, directions)
+    assert hits.distance == pytest.approx([4.0, 7.0, np.inf, 10.0], rel=1e-6)
+    assert hits.material[[0, 1, 3]].tolist() == [Material.ROOF, Material.ASPHALT, Material.ASPHALT]
+    assert np.abs(hits.normal[[0, 1, 3]]) == pytest.approx(np.tile([0.0, 0.0, 1.0], (3, 1)))
+
+
+def test_rays_agree_with_open3d():
+    o3d = import_open3d()
+    mesh = make_site("suburb", 1, 120.0).mesh(0)
+    rng = np.random.default_rng(0)
+    origins = np.c_[rng.uniform(-60, 60, (50_000, 2)), rng.uniform(20, 60, 50_000)]
+    directions = rng.normal(size=(50_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    hits = Caster(mesh).cast(origins, directions)
+    scene, tensor = o3d.t.geometry.RaycastingScene(), o3d.core.Tensor
+    scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
+    other = scene.cast_rays(tensor(np.c_[origins, directions].astype(np.float32)))
+    distance = other["t_hit"].numpy()
+    met = np.isfinite(distance)
+    assert np.array_equal(np.isfinite(hits.distance), met)
+    assert np.abs(hits.distance[met] - distance[met]).max() < 1e-4
+    same = mesh.material[other["primitive_ids"].numpy()[met]] == hits.material[met]
+    assert same.mean() > 0.999
+
+
+def test_one_beam_that_meets_something_else_changes_no_other():
+    out = MeshBuilder()
+    out.polygons(sheet(0.0, 0), Material.SOIL)
+    out.polygons(sheet(8.0, 0), Material.LEAF)
+    caster = Caster(out.build())
+    xy = np.random.default_rng(1).uniform(-40, 40, (500, 2))
+    beams = plumb_beams(xy, 60.0)
+    away = plumb_beams(xy, 60.0)
+    away.direction[7] = (0.0, 0.0, 1.0)
+    scans = [
+        instruments.measure(caster, b, instruments.AIRBORNE, np.random.default_rng(2)) for b in (beams, away)
+    ]
+    others = [scan.part(scan.extra["GpsTime"] != 7.0) for scan in scans]
+    assert not (scans[1].extra["GpsTime"] == 7.0).any()
+    assert np.array_equal(others[0].xyz, others[1].xyz)
+    assert np.array_equal(others[0].extra["Intensity"], others[1].extra["Intensity"])

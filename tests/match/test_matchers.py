@@ -234,7 +234,7 @@ def test_superpoint_and_lightglue_of_random_weights_run_the_whole_path(town_file
     result = register(
         tmp_path / "turned.laz", target, tmp_path / "out", matcher="superpoint", models=small_models, cell=0.5
     )
-    match = next(entry for entry in result.report if entry["type"] == "mtpcr.match")["metadata"]
+    match = next(record for record in result.report if record.type == "mtpcr.match").metadata
     assert match["method"] == "superpoint"
     assert len(match["turns_deg"]) == 8
     # random projections of patches tell places apart: the yaw is found, and not by ICP alone
@@ -262,7 +262,7 @@ def test_paper_profile_runs_the_whole_path(town_files, small_models, tmp_path):
         matcher="superpoint",
         models=small_models,
     )
-    types = [entry["type"] for entry in result.report]
+    types = [record.type for record in result.report]
     steps = ["mtpcr.enhance", "mtpcr.match", "mtpcr.focus", "mtpcr.inverse_mapping"]
     assert [t for t in types if t in steps] == steps
     assert result.verdict.name in ("accepted", "doubtful", "refused")

@@ -1,1 +1,1 @@
-"""Other people's methods, run under the same protocol as ours."""
+"""Published methods of others, run under the same protocol as the registration."""

@@ -17,7 +17,7 @@ A JSON file describes it::
   "laz" (LAS 1.4, millimetres). Metres, z up, near the origin. ``crs`` (an EPSG code) is written into a LAZ.
 - ``voxel`` thins the clouds to a point per voxel of this edge, metres, before they are written.
 - The command writes the 4x4 that takes source to target as text to ``{result}``: the last sixteen numbers
-  of the file count, row by row. Lines of words before them do no harm. A scale in it is taken out, and
+  of the file count, row by row. Lines of text before them are skipped. A scale in it is taken out, and
   noted with the run.
 - An exit code other than 0, no result within the time limit, or more memory than allowed: a run without an
   answer, with the end of what the command printed as the reason. The memory limit is on the address space
@@ -39,16 +39,14 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from mtpcr_geo.benchmark import memory
 from mtpcr_geo.benchmark.methods import Estimate
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.pipeline.registry import first_problem
 
-Floats = NDArray[np.float64]
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _SAMPLE_S = 0.05
 # runs the command with a limit on its address space; a limit in the parent would bind the parent
@@ -59,7 +57,7 @@ _LIMITER = (
 
 
 class Description(BaseModel):
-    """What the JSON file says."""
+    """The content of the JSON file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -111,7 +109,7 @@ class External:
         return replace(answer, T_target_source=T, details={"scale": scale})
 
     def _run(self, folder: Path, words: dict[str, str]) -> Estimate:
-        reported = folder / "told.txt"
+        reported = folder / "output.txt"
         command = [_filled(word, words) for word in self.description.command]
         limit = self.description.memory_limit_mib
         if limit is not None and os.name == "posix":
@@ -198,7 +196,7 @@ def write_points(path: Path, xyz: Floats, description: Description) -> None:
     else:
         from pyproj import CRS
 
-        from mtpcr_geo.benchmark.simulator.pairs import write_laz
+        from mtpcr_geo.benchmark.pairs import write_laz
         from mtpcr_geo.core.cloud import ArrayCloud
 
         crs = None if description.crs is None else CRS.from_epsg(description.crs)
@@ -221,7 +219,7 @@ def _waited(process: subprocess.Popen[bytes], limit: float) -> tuple[int, float 
             return process.wait(_SAMPLE_S), peak, False
         except subprocess.TimeoutExpired:
             # what the system adds up at the end would count this process too, as it was at the fork
-            now = memory.tree_mib(process.pid)
+            now = tree_memory_mib(process.pid)
             peak = now if peak is None else max(peak, now or 0.0)
         if time.monotonic() > end:
             if os.name == "posix":
@@ -232,7 +230,22 @@ def _waited(process: subprocess.Popen[bytes], limit: float) -> tuple[int, float 
             return process.wait(), peak, True
 
 
+def tree_memory_mib(pid: int) -> float | None:
+    """Return the resident memory of a process and all that descend from it, now, in MiB.
+
+    None where the system does not tell (it is read from ``/proc``).
+    """
+    folder = Path("/proc") / str(pid)
+    try:
+        status = (folder / "status").read_text()
+        children = (folder / "task" / str(pid) / "children").read_text().split()
+    except OSError:
+        return None
+    own = next((int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS:")), 0)
+    return own / 1024 + sum(tree_memory_mib(int(child)) or 0.0 for child in children)
+
+
 def _end_of(reported: Path) -> str:
     lines = reported.read_text(encoding="utf-8", errors="replace").split("\n")
-    said = [line.strip() for line in lines if line.strip()]
-    return said[-1][:300] if said else "it said nothing"
+    printed = [line.strip() for line in lines if line.strip()]
+    return printed[-1][:300] if printed else "it printed nothing"

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.benchmark.baselines.open3d import import_open3d
 from mtpcr_geo.benchmark.methods import Estimate
-from mtpcr_geo.benchmark.simulator.raycast import import_open3d
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats, Indices
 
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
 _FEWEST_MATCHES = 3
 _ROWS, _COLUMNS = 512, 2048
 
@@ -36,28 +35,32 @@ class Features:
         return np.asarray(self.cloud.points)
 
 
-def features(xyz: Floats, voxel: float, *, normals: float = 2.0, reach: float = 5.0) -> Features:
+def features(
+    xyz: Floats, voxel: float, *, normal_radius: float = 2.0, feature_radius: float = 5.0
+) -> Features:
     """Thin a cloud and describe its points.
 
     Args:
         xyz: (n, 3) metres.
         voxel: edge of the voxels that thin it, metres.
-        normals: radius of the neighbours that give a normal, in voxels.
-        reach: radius of the neighbours that a feature describes, in voxels.
+        normal_radius: radius of the neighbours that give a normal, in voxels.
+        feature_radius: radius of the neighbours that a feature describes, in voxels.
 
     """
     o3d = import_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.ascontiguousarray(xyz)))
     cloud = cloud.voxel_down_sample(voxel)
     near = o3d.geometry.KDTreeSearchParamHybrid
-    cloud.estimate_normals(near(radius=normals * voxel, max_nn=30))
+    cloud.estimate_normals(near(radius=normal_radius * voxel, max_nn=30))
     # all normals to one side: up, which both views of a surface share
     cloud.orient_normals_to_align_with_direction(np.array([0.0, 0.0, 1.0]))
-    fpfh = o3d.pipelines.registration.compute_fpfh_feature(cloud, near(radius=reach * voxel, max_nn=100))
+    fpfh = o3d.pipelines.registration.compute_fpfh_feature(
+        cloud, near(radius=feature_radius * voxel, max_nn=100)
+    )
     return Features(cloud, fpfh)
 
 
-def mutual_matches(source: Features, target: Features) -> NDArray[np.int64]:
+def mutual_matches(source: Features, target: Features) -> Indices:
     """Return (n, 2) numbers of source and target points that are each other's nearest in feature space."""
     # all against all: trees gain nothing in 33 dimensions, and Open3D's took three times as long
     a, b = (np.asarray(one.fpfh.data, np.float32).T for one in (source, target))
@@ -88,11 +91,11 @@ def _nearest_both_ways(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[
     return there, back
 
 
-def at_most(matches: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:
-    """Draw at most so many of the matches, in their order."""
-    if len(matches) <= most:
+def sample_matches(matches: Indices, max_matches: int, seed: int) -> Indices:
+    """Draw at most ``max_matches`` of the matches, in their order."""
+    if len(matches) <= max_matches:
         return matches
-    chosen = np.random.default_rng(seed).choice(len(matches), most, replace=False)
+    chosen = np.random.default_rng(seed).choice(len(matches), max_matches, replace=False)
     return matches[np.sort(chosen)]
 
 
@@ -114,14 +117,14 @@ class FpfhMethod(ABC):
 
     Args:
         voxel: thinning, metres; all radii grow with it.
-        icp: whether point-to-point ICP follows, with a reach of 1.5 voxels.
+        icp: whether point-to-point ICP follows, its correspondences up to 1.5 voxels long.
 
     Attributes:
-        most: matches at most, drawn at random; all if None.
+        max_matches: largest number of matches used, drawn at random; all if None.
 
     """
 
-    most: int | None = None
+    max_matches: int | None = None
 
     def __init__(self, voxel: float = 1.0, icp: bool = True) -> None:
         if voxel <= 0:
@@ -136,8 +139,8 @@ class FpfhMethod(ABC):
         matches = mutual_matches(s, t)
         if len(matches) < _FEWEST_MATCHES:
             return Estimate(None, "refused", f"only {len(matches)} matches")
-        if self.most is not None:
-            matches = at_most(matches, self.most, seed)
+        if self.max_matches is not None:
+            matches = sample_matches(matches, self.max_matches, seed)
         answer = self.solve(s, t, matches, seed)
         if answer.T_target_source is None or not self.icp:
             return answer
@@ -163,13 +166,13 @@ class PrunedFpfhMethod(FpfhMethod):
 
     Args:
         voxel, icp: as for all.
-        most: matches at most, as KISS-Matcher has it; the graph grows with the square.
+        max_matches: largest number of matches used, as KISS-Matcher has it; the graph grows with the square.
 
     """
 
-    def __init__(self, voxel: float = 1.0, icp: bool = True, most: int = 5000) -> None:
+    def __init__(self, voxel: float = 1.0, icp: bool = True, max_matches: int = 5000) -> None:
         super().__init__(voxel, icp)
-        self.most = most
+        self.max_matches = max_matches
 
 
 class FpfhSvd(FpfhMethod):
@@ -186,7 +189,7 @@ class FpfhRansac(FpfhMethod):
 
     Args:
         voxel, icp: as for all.
-        iterations: at most.
+        iterations: largest number of samples.
 
     """
 
@@ -197,17 +200,18 @@ class FpfhRansac(FpfhMethod):
     def solve(self, source: Features, target: Features, matches: Indices, seed: int) -> Estimate:
         """Draw matches until the confidence is 0.999."""
         o3d = import_open3d()
-        kit, reach = o3d.pipelines.registration, 1.5 * self.voxel
+        kit = o3d.pipelines.registration
+        longest = 1.5 * self.voxel
         found = kit.registration_ransac_based_on_correspondence(
             source.cloud,
             target.cloud,
             o3d.utility.Vector2iVector(matches.astype(np.int32)),
-            reach,
+            longest,
             kit.TransformationEstimationPointToPoint(False),
             3,
             [
                 kit.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-                kit.CorrespondenceCheckerBasedOnDistance(reach),
+                kit.CorrespondenceCheckerBasedOnDistance(longest),
             ],
             kit.RANSACConvergenceCriteria(self.iterations, 0.999),
         )

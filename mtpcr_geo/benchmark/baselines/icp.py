@@ -1,13 +1,11 @@
-"""Point-to-point ICP from where the clouds stand: the floor that any global method must clear."""
+"""Point-to-point ICP from where the clouds stand: the baseline that any global method must beat."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.methods import Estimate
-
-Floats = NDArray[np.float64]
+from mtpcr_geo.core.arrays import Floats
 
 
 class PointToPointIcp:
@@ -15,13 +13,16 @@ class PointToPointIcp:
 
     Args:
         voxel: thinning, metres.
-        reach: farthest correspondence, metres.
-        iterations: at most.
+        max_correspondence_distance: longest distance between matched points, metres.
+        max_iterations: of the fit.
 
     """
 
-    def __init__(self, voxel: float = 1.0, reach: float = 10.0, iterations: int = 100) -> None:
-        self.voxel, self.reach, self.iterations = voxel, reach, iterations
+    def __init__(
+        self, voxel: float = 1.0, max_correspondence_distance: float = 10.0, max_iterations: int = 100
+    ) -> None:
+        self.voxel, self.max_iterations = voxel, max_iterations
+        self.max_correspondence_distance = max_correspondence_distance
 
     def estimate(self, source: Floats, target: Floats, *, seed: int) -> Estimate:
         """Iterate from the identity; the seed is not used."""
@@ -32,8 +33,8 @@ class PointToPointIcp:
             source,
             registration_type="ICP",
             downsampling_resolution=self.voxel,
-            max_correspondence_distance=self.reach,
-            max_iterations=self.iterations,
+            max_correspondence_distance=self.max_correspondence_distance,
+            max_iterations=self.max_iterations,
             num_threads=1,
         )
         return Estimate(

@@ -10,13 +10,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mtpcr_geo.benchmark.baselines.fpfh import Features, Indices, PrunedFpfhMethod
+from mtpcr_geo.benchmark.baselines.fpfh import Features, PrunedFpfhMethod
 from mtpcr_geo.benchmark.methods import Estimate
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats, Indices
 
-Floats = NDArray[np.float64]
 FEWEST_INLIERS = 5
 
 

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from mtpcr_geo.benchmark.baselines.fpfh import Features, Indices, PrunedFpfhMethod
+from mtpcr_geo.benchmark.baselines.fpfh import Features, PrunedFpfhMethod
 from mtpcr_geo.benchmark.methods import Estimate
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Indices
 
 
 class FpfhTeaser(PrunedFpfhMethod):

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.simulator.mesh import Frame, Material, MeshBuilder
 
-Floats = NDArray[np.float64]
 RoofForm = Literal["gable", "hip", "shed", "flat", "mansard", "sawtooth"]
 FOUNDATION_M = 3.0
 

@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.simulator.mesh import Frame, Material, MeshBuilder
-
-Floats = NDArray[np.float64]
+from mtpcr_geo.core.arrays import Floats
 
 
 def add_car(out: MeshBuilder, frame: Frame, rng: np.random.Generator) -> None:

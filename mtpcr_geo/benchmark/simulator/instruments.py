@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.simulator.mesh import LAS_CLASS, REFLECTANCE, RELIEF_M, Material
 from mtpcr_geo.benchmark.simulator.raycast import Caster
+from mtpcr_geo.core.arrays import Floats, Indices, Mask
 
-Floats = NDArray[np.float64]
 Table = dict[str, NDArray[np.generic]]
 # share of the time for which one who passes by is at any one place of the way
 PRESENCE = 0.12
@@ -26,7 +26,7 @@ class Instrument:
         noise_m: standard deviation of a range.
         divergence_rad: standard deviation of a beam's direction.
         drop_out: share of returns lost for no reason.
-        returns: most returns of one pulse.
+        returns: largest number of returns of one pulse.
         closest_m: nearest range measured.
 
     """
@@ -86,7 +86,8 @@ def measure(caster: Caster, beams: Beams, how: Instrument, rng: np.random.Genera
 
     A beam that meets a leaf or a wire is only partly stopped: it goes on behind with a chance, up to
     the instrument's number of returns. One who walks or drives by is met only at times. Weak returns (far,
-    dark, grazing) are lost; panes of glass and windows in facades mostly lose theirs.
+    dark, grazing) are lost; panes of glass and windows in facades mostly lose theirs. Every beam has draws
+    of its own, so that one which meets something else in the last digit on another machine changes no other.
 
     Args:
         caster: the site.
@@ -100,7 +101,8 @@ def measure(caster: Caster, beams: Beams, how: Instrument, rng: np.random.Genera
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     alive = np.arange(n)
     gone = np.zeros(n)
-    found: list[tuple[NDArray[np.int64], Floats, Floats, NDArray[np.uint8]]] = []
+    passes, noises = rng.spawn(2)
+    found: list[tuple[Indices, Floats, Floats, NDArray[np.uint8]]] = []
     tries = np.full(n, how.returns + 1)
     for _ in range(how.returns + 1 + MOST_PASSED):
         start = beams.origin[alive] + gone[alive, None] * direction[alive]
@@ -108,46 +110,45 @@ def measure(caster: Caster, beams: Beams, how: Instrument, rng: np.random.Genera
         ok = np.isfinite(hits.distance)
         alive, material = alive[ok], hits.material[ok]
         gone[alive] += hits.distance[ok]
+        draw = passes.random((4, n))[:, alive]
         facing = np.abs((hits.normal[ok] * direction[alive]).sum(axis=1))
-        seen = _returned(gone[alive], facing, material, how, rng)
+        seen = _returned(gone[alive], facing, material, how, draw[0])
         seen &= ~_window(
-            beams.origin[alive] + gone[alive, None] * direction[alive], hits.normal[ok], material, rng
+            beams.origin[alive] + gone[alive, None] * direction[alive], hits.normal[ok], material, draw[1]
         )
         found.append((alive[seen], gone[alive[seen]].copy(), facing[seen], material[seen]))
         thin = np.isin(material, (Material.LEAF, Material.WIRE, Material.PASSING))
         tries[alive] -= material != Material.PASSING
         onward = np.where(seen, 0.45 if how.returns > 1 else 0.0, 1.0)
-        on = thin & (rng.random(len(alive)) < onward) & (tries[alive] > 0)
+        on = thin & (draw[2] < onward) & (tries[alive] > 0)
         alive = alive[on]
-        gone[alive] += 0.05 + 0.5 * rng.random(len(alive))
+        gone[alive] += 0.05 + 0.5 * draw[3, on]
         if not len(alive):
             break
-    return _points(beams, direction, found, how, rng)
+    return _points(beams, direction, found, how, noises)
 
 
 def _returned(
-    distance: Floats, facing: Floats, material: NDArray[np.uint8], how: Instrument, rng: np.random.Generator
-) -> NDArray[np.bool_]:
+    distance: Floats, facing: Floats, material: NDArray[np.uint8], how: Instrument, draw: Floats
+) -> Mask:
     strength = REFLECTANCE[material] / 0.5 * np.where(material == Material.LEAF, 0.8, np.sqrt(facing))
     limit = how.reach_m * np.sqrt(strength)
     chance = (1 - how.drop_out) / (1 + np.exp(np.clip((distance - limit) / (0.08 * limit), -50, 50)))
     chance *= np.where(material == Material.PASSING, PRESENCE, 1.0)
-    return np.asarray((distance > how.closest_m) & (rng.random(len(distance)) < chance))
+    return np.asarray((distance > how.closest_m) & (draw < chance))
 
 
-def _window(
-    xyz: Floats, normal: Floats, material: NDArray[np.uint8], rng: np.random.Generator
-) -> NDArray[np.bool_]:
-    """Say which hits on facades fall on a pane and are lost."""
+def _window(xyz: Floats, normal: Floats, material: NDArray[np.uint8], draw: Floats) -> Mask:
+    """Return which hits on facades fall on a pane and are lost."""
     along = normal[:, 0] * xyz[:, 1] - normal[:, 1] * xyz[:, 0]
     pane = (np.mod(along / 2.6, 1.0) < 0.42) & (np.abs(np.mod(xyz[:, 2] / 2.9, 1.0) - 0.5) < 0.24)
-    return np.asarray((material == Material.FACADE) & pane & (rng.random(len(xyz)) < 0.7))
+    return np.asarray((material == Material.FACADE) & pane & (draw < 0.7))
 
 
 def _points(
     beams: Beams,
     direction: Floats,
-    found: list[tuple[NDArray[np.int64], Floats, Floats, NDArray[np.uint8]]],
+    found: list[tuple[Indices, Floats, Floats, NDArray[np.uint8]]],
     how: Instrument,
     rng: np.random.Generator,
 ) -> Scan:
@@ -164,11 +165,13 @@ def _points(
     keep = number <= how.returns
     pulse, distance, facing, material, number = (a[keep] for a in (pulse, distance, facing, material, number))
     total = np.minimum(np.repeat(total, total)[keep], how.returns)
-    noise = rng.normal(0, np.hypot(how.noise_m, RELIEF_M[material]))
+    beam_and_return = pulse, number - 1
+    spread = rng.normal(size=(len(direction), how.returns))[beam_and_return]
+    noise = spread * np.hypot(how.noise_m, RELIEF_M[material])
     xyz = beams.origin[pulse] + (distance + noise)[:, None] * direction[pulse] + beams.drift[pulse]
     fade = (1.0 + distance / how.reach_m) ** 2
     light = REFLECTANCE[material] * np.where(material == Material.LEAF, 0.6, facing) / fade
-    light = light * rng.gamma(20.0, 1 / 20.0, len(light))
+    light = light * rng.gamma(20.0, 1 / 20.0, (len(direction), how.returns))[beam_and_return]
     extra: Table = {
         "Intensity": np.clip(light * 60000, 1, 65535).astype(np.uint16),
         "ReturnNumber": number.astype(np.uint8),

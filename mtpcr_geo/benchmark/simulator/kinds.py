@@ -18,7 +18,7 @@ class SiteStyle:
     """What a kind of site is made of.
 
     Attributes:
-        description: in words.
+        description: a short text.
         ground, roads: how the land lies and how the roads run.
         lots: how houses stand: "terraced", "detached", "halls", "identical", "farms" or "none".
         built: share of lots with a house on it.

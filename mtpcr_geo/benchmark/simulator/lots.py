@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.simulator.buildings import Building, RoofForm, add_building
 from mtpcr_geo.benchmark.simulator.furniture import add_wall
@@ -15,8 +14,7 @@ from mtpcr_geo.benchmark.simulator.mesh import Frame, Mesh, MeshBuilder
 from mtpcr_geo.benchmark.simulator.roads import Network
 from mtpcr_geo.benchmark.simulator.terrain import Ground
 from mtpcr_geo.benchmark.simulator.vegetation import Plants, Species, add_hedge
-
-Floats = NDArray[np.float64]
+from mtpcr_geo.core.arrays import Floats, Indices, Mask
 
 
 class Occupancy:
@@ -32,13 +30,13 @@ class Occupancy:
         n = int(np.ceil(2 * half))
         self.taken = np.zeros((n, n), bool)
 
-    def _cells(self, xy: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    def _cells(self, xy: Floats) -> tuple[Indices, Indices, Mask]:
         cell = np.floor(xy + self.half).astype(np.int64)
         inside = np.asarray(((cell >= 0) & (cell < len(self.taken))).all(axis=-1))
         cell = np.clip(cell, 0, len(self.taken) - 1)
         return cell[..., 1], cell[..., 0], inside
 
-    def is_taken(self, xy: Floats) -> NDArray[np.bool_]:
+    def is_taken(self, xy: Floats) -> Mask:
         """Say for (n, 2) places whether they are taken or off the site."""
         r, c, inside = self._cells(xy)
         return self.taken[r, c] | ~inside

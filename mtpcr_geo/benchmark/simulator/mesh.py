@@ -11,7 +11,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from mtpcr_geo.core.arrays import Floats, Indices
 
 
 class Material(IntEnum):
@@ -71,7 +71,7 @@ class Mesh:
     """
 
     vertices: Floats
-    triangles: NDArray[np.int64]
+    triangles: Indices
     material: NDArray[np.uint8]
 
 
@@ -80,7 +80,7 @@ class MeshBuilder:
 
     def __init__(self) -> None:
         self._vertices: list[Floats] = []
-        self._triangles: list[NDArray[np.int64]] = []
+        self._triangles: list[Indices] = []
         self._material: list[NDArray[np.uint8]] = []
         self._count = 0
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from mtpcr_geo.benchmark.simulator.scanners import Block
+from mtpcr_geo.core.arrays import Floats, Indices
 
-Floats = NDArray[np.float64]
 
-
-def occupied_cells(xy: Floats, cell: float = 1.0) -> NDArray[np.int64]:
+def occupied_cells(xy: Floats, cell: float = 1.0) -> Indices:
     """Find the cells (n, 2) (column, row), `cell` metres wide, that hold any of the (m, 2) places."""
     index = np.floor(np.asarray(xy)[:, :2] / cell).astype(np.int64)
     if not len(index):
@@ -23,7 +21,7 @@ def occupied_cells(xy: Floats, cell: float = 1.0) -> NDArray[np.int64]:
     return np.asarray(np.stack([key % width, key // width], axis=1) + low, np.int64)
 
 
-def near_shares(a: NDArray[np.int64], b: NDArray[np.int64]) -> tuple[float, float]:
+def near_shares(a: Indices, b: Indices) -> tuple[float, float]:
     """Share of the cells `a` with a cell of `b` in their 3x3 neighbourhood, and the other way round.
 
     Args:
@@ -51,7 +49,7 @@ def near_shares(a: NDArray[np.int64], b: NDArray[np.int64]) -> tuple[float, floa
 
 
 def place_block(
-    cells: NDArray[np.int64], half: float, yaw: float, source_share: float, target_share: float
+    cells: Indices, half: float, yaw: float, source_share: float, target_share: float
 ) -> tuple[Block, float]:
     """Find the block from whose air survey the ground cloud gets the shares asked for.
 

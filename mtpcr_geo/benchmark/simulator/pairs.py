@@ -3,37 +3,35 @@
     pair = simulate_pair("town", seed=1)
     write_pair(Path("town_1"), pair)
 
-A site is made from its seed (`sim.site`), scanned on the ground in one epoch and from the air in
-another (`sim.scanners`), and the ground cloud is turned, tilted and shifted. The same seed and
+A site is made from its seed (`site`), scanned on the ground in one epoch and from the air in
+another (`scanners`), and the ground cloud is turned, tilted and shifted. The same seed and
 options give the same clouds, bit for bit, on one machine.
 """
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mtpcr_geo.benchmark.pairs import write_folder
 from mtpcr_geo.benchmark.simulator import instruments, scanners
 from mtpcr_geo.benchmark.simulator.kinds import KINDS, STYLES, Kind
+from mtpcr_geo.benchmark.simulator.options import PairOptions, pair_options
 from mtpcr_geo.benchmark.simulator.overlap import near_shares, occupied_cells, place_block
 from mtpcr_geo.benchmark.simulator.raycast import Caster
 from mtpcr_geo.benchmark.simulator.scanners import Block
 from mtpcr_geo.benchmark.simulator.site import MARGIN_M, Site, make_site
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.io.outputs import OutputSet
+from mtpcr_geo.core.voxels import first_in_voxels
 
-__all__ = ["KINDS", "Kind", "SimulatedPair", "describe", "simulate_pair", "write_laz", "write_pair"]
+__all__ = ["KINDS", "Kind", "SimulatedPair", "describe", "simulate_from", "simulate_pair", "write_pair"]
 
-Floats = NDArray[np.float64]
-Ground = Literal["robot", "tripod"]
-Air = Literal["airborne", "uav"]
 TARGET_EPSG = 25832
 # parts of the ground scan (of its time) tried in turn until the shares come out as asked
 _SHORTER = (
@@ -61,7 +59,7 @@ class SimulatedPair:
         overlap_source: share of the source's occupied 1 m cells (true pose, seen from above) that lie
             within one cell of an occupied cell of the target.
         overlap_target: the same the other way round.
-        description: in words.
+        description: of the site and the scanners.
         options: what it was made with.
 
     """
@@ -77,82 +75,62 @@ class SimulatedPair:
     options: dict[str, Any]
 
 
-def simulate_pair(
-    kind: Kind,
-    seed: int = 0,
-    *,
-    extent_m: float = 400.0,
-    overlap: float = 0.18,
-    tilt_deg: float = 5.0,
-    ground: Ground = "robot",
-    air: Air = "airborne",
-    air_density: float = 6.0,
-    ground_beams: int = 2_000_000,
-    voxel_m: float = 0.12,
-    drift_m: float = 0.04,
-    leafiness: tuple[float, float] = (1.0, 1.0),
-    epochs_apart: int = 1,
-) -> SimulatedPair:
+def simulate_pair(kind: Kind, seed: int = 0, **options: Any) -> SimulatedPair:
     """Make a site and scan it from the ground and from the air.
 
     Args:
         kind: one of `KINDS`.
-        seed: chance of everything: site, scanners, noise, transform.
-        extent_m: edge of the site's square, metres (100 to 1500).
-        overlap: share aimed at, on both sides; what came out is in the pair.
-        tilt_deg: by how much the ground cloud's frame is off level, degrees (about any level axis).
-        ground: "robot" (spinning lidar driven along roads) or "tripod" (static set-ups along them).
-        air: "airborne" (line scanner, two flight lines) or "uav" (spinning lidar, 70 m up).
-        air_density: pulses per square metre.
-        ground_beams: beams sent from the ground, in all.
-        voxel_m: the ground cloud is thinned to a point per voxel of this edge, as maps are; 0 keeps all.
-        drift_m: standard deviation of the robot's error of place, metres.
-        leafiness: share of leaves on the trees, on the ground's and the air's day (winter: 0.25).
-        epochs_apart: 0 for one epoch, 1 or more for plants, crops and cars that differ.
+        seed: of everything: site, scanners, noise, transform.
+        options: further fields of `PairOptions`.
 
     Raises:
-        OptionError: if an option is out of its range.
-        MissingPartError: if Open3D cannot be loaded.
+        OptionError: if an option is unknown or out of its range, or the ground scan sees nothing.
+        MissingPartError: if ``embreex`` is not installed.
 
     """
-    _check(kind, extent_m, overlap, air_density, ground, air)
-    site = make_site(kind, seed, extent_m)
+    return simulate_from(pair_options(kind=kind, seed=seed, **options))
+
+
+def simulate_from(options: PairOptions) -> SimulatedPair:
+    """Make the pair of a set of options; see `simulate_pair`."""
+    kind, seed = options.kind, options.seed
+    site = make_site(kind, seed, options.extent_m)
     chance = np.random.default_rng([seed, 23])
     yaw = float(chance.uniform(-0.2, 0.2))
     path = walk_through(site, yaw)
-    caster = Caster(site.mesh(0, leafiness[0]))
-    if ground == "robot":
-        beams = scanners.robot_beams(path, site.ground.height, ground_beams, chance, drift_m=drift_m)
+    caster = Caster(site.mesh(0, options.ground_leaves))
+    if options.ground == "robot":
+        beams = scanners.robot_beams(
+            path, site.ground.height, options.ground_beams, chance, drift_m=options.drift_m
+        )
         low = instruments.measure(caster, beams, instruments.ROBOT, chance)
     else:
-        stops = path[:: max(1, len(path) // max(3, int(extent_m / 40)))]
-        beams = scanners.tripod_beams(stops, site.ground.height, ground_beams, chance)
+        stops = path[:: max(1, len(path) // max(3, int(options.extent_m / 40)))]
+        beams = scanners.tripod_beams(stops, site.ground.height, options.ground_beams, chance)
         low = instruments.measure(caster, beams, instruments.TRIPOD, chance)
     low = low.part(np.abs(low.xyz[:, :2]).max(axis=1) < site.half + MARGIN_M - 2.0)
-    low = low.part(thinned(low.xyz, voxel_m))
+    if options.voxel_m > 0:
+        low = low.part(first_in_voxels(low.xyz, options.voxel_m))
     if not low.extra["GpsTime"].size:
         raise OptionError(
-            f"the ground scan of {kind} {seed} saw nothing; send more beams than {ground_beams}"
+            f"the ground scan of {kind} {seed} saw nothing; send more beams than {options.ground_beams}"
         )
 
-    low, block, path = shared_block(low, path, site, yaw, (overlap, overlap))
-    if epochs_apart or leafiness[1] != leafiness[0]:
-        caster = Caster(site.mesh(epochs_apart, leafiness[1]))
-    fly = scanners.airborne_beams if air == "airborne" else scanners.uav_beams
-    how = instruments.AIRBORNE if air == "airborne" else instruments.UAV
-    high = instruments.measure(caster, fly(block, site.ground.height, air_density, chance), how, chance)
+    low, block, path = shared_block(low, path, site, yaw, (options.overlap, options.overlap))
+    if options.epochs_apart or options.air_leaves != options.ground_leaves:
+        caster = Caster(site.mesh(options.epochs_apart, options.air_leaves))
+    fly = scanners.airborne_beams if options.air == "airborne" else scanners.uav_beams
+    how = instruments.AIRBORNE if options.air == "airborne" else instruments.UAV
+    high = instruments.measure(
+        caster, fly(block, site.ground.height, options.air_density, chance), how, chance
+    )
     high = high.part(block.contains(high.xyz[:, :2]))
 
-    T_target_site, T_source_site = _frames(path, site, tilt_deg, np.random.default_rng([seed, 29]))
+    T_target_site, T_source_site = _frames(path, site, options.tilt_deg, np.random.default_rng([seed, 29]))
     shares = near_shares(occupied_cells(low.xyz), occupied_cells(high.xyz))
     from pyproj import CRS
 
-    options = {
-        "kind": kind, "seed": seed, "extent_m": extent_m, "overlap": overlap, "tilt_deg": tilt_deg,
-        "ground": ground, "air": air, "air_density": air_density, "ground_beams": ground_beams,
-        "voxel_m": voxel_m, "drift_m": drift_m, "leafiness": list(leafiness), "epochs_apart": epochs_apart,
-        "path_m": round(scanners.path_length(path), 1),
-    }  # fmt: skip
+    made = options.model_dump(mode="json") | {"path_m": round(scanners.path_length(path), 1)}
     return SimulatedPair(
         name=f"{kind}_{seed}",
         kind=kind,
@@ -163,26 +141,11 @@ def simulate_pair(
         T_target_source=T_target_site @ transforms.inverse(T_source_site),
         overlap_source=shares[0],
         overlap_target=shares[1],
-        description=f"simulated {STYLES[kind].description}; {ground} on the ground, {air} above",
-        options=options,
+        description=(
+            f"simulated {STYLES[kind].description}; {options.ground} on the ground, {options.air} above"
+        ),
+        options=made,
     )
-
-
-def _check(kind: str, extent_m: float, overlap: float, density: float, ground: str, air: str) -> None:
-    for name, value, allowed in (
-        ("kind", kind, KINDS),
-        ("ground", ground, get_args(Ground)),
-        ("air", air, get_args(Air)),
-    ):
-        if value not in allowed:
-            raise OptionError(f"no {name} {value!r} to simulate; choose one of {', '.join(allowed)}")
-    for name, number, low, high in (
-        ("extent_m", extent_m, 100.0, 1500.0),
-        ("overlap", overlap, 0.01, 0.8),
-        ("air_density", density, 0.1, 200.0),
-    ):
-        if not low <= number <= high:
-            raise OptionError(f"{name} is {number:g}; it must lie between {low:g} and {high:g}")
 
 
 def walk_through(site: Site, yaw: float) -> Floats:
@@ -230,16 +193,6 @@ def shared_block(
     return best[1:]
 
 
-def thinned(xyz: Floats, voxel: float) -> NDArray[np.int64]:
-    """Return the numbers of the first points of each voxel, in their old order."""
-    if voxel <= 0:
-        return np.arange(len(xyz))
-    cell = np.floor((xyz - xyz.min(axis=0)) / voxel).astype(np.int64)
-    size = cell.max(axis=0) + 1
-    _, first = np.unique((cell[:, 2] * size[1] + cell[:, 1]) * size[0] + cell[:, 0], return_index=True)
-    return np.sort(first)
-
-
 def _frames(path: Floats, site: Site, tilt_deg: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Draw the target's frame (a far CRS, turned) and the source's (at the robot's start, not level)."""
     far = np.array(
@@ -269,40 +222,11 @@ def write_pair(folder: Path, pair: SimulatedPair, *, overwrite: bool = False) ->
         OutputError: if a file exists already or the folder cannot be written.
 
     """
-    folder = Path(folder)
-    with OutputSet(overwrite) as out:
-        for name, cloud in (("source.laz", pair.source), ("target.laz", pair.target)):
-            write_laz(out.path(folder / name), cloud)
-        out.path(folder / "pair.json").write_text(json.dumps(describe(pair), indent=1) + "\n", "utf-8")
-        return out.commit()
-
-
-def write_laz(path: Path, cloud: ArrayCloud) -> None:
-    """Write a cloud held in memory as LAS 1.4 point format 6, scale 0.001, with its CRS as WKT."""
-    import laspy
-
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    header.scales = np.full(3, 0.001)
-    header.offsets = np.floor(cloud.minimum) if cloud.count else np.zeros(3)
-    header.global_encoding.wkt = True
-    if cloud.crs is not None:
-        header.add_crs(cloud.crs)
-    las = laspy.LasData(header)
-    las.xyz = cloud.xyz
-    for ours, theirs in (
-        ("Intensity", "intensity"),
-        ("ReturnNumber", "return_number"),
-        ("NumberOfReturns", "number_of_returns"),
-        ("Classification", "classification"),
-        ("GpsTime", "gps_time"),
-    ):
-        if ours in cloud.extra:
-            las[theirs] = cloud.extra[ours]
-    las.write(str(path))
+    return write_folder(Path(folder), pair.source, pair.target, describe(pair), overwrite=overwrite)
 
 
 def describe(pair: SimulatedPair, names: tuple[str, str] = ("source.laz", "target.laz")) -> dict[str, Any]:
-    """Return what ``pair.json`` says: CRS, truth, overlap, the two clouds by file name, how it was made."""
+    """Return the content of ``pair.json``: CRS, truth, overlap, both clouds by file name, options."""
     crs = pair.target.crs
     return {
         "id": pair.name,
@@ -331,4 +255,5 @@ def _cloud_facts(file: str, cloud: ArrayCloud) -> dict[str, Any]:
         "min": cloud.minimum.round(3).tolist(),
         "max": cloud.maximum.round(3).tolist(),
         "extent_m": (cloud.maximum - cloud.minimum).round(1).tolist(),
+        "centroid": cloud.xyz.mean(axis=0).round(3).tolist(),
     }

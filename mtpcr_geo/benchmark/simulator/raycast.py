@@ -1,8 +1,7 @@
-"""Casting rays at a mesh through Open3D, imported only here and only when needed."""
+"""Casting rays at a mesh through Embree, whose binding is imported only here and only when needed."""
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,33 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.simulator.mesh import Mesh
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import MissingPartError
 
-Floats = NDArray[np.float64]
 BATCH_RAYS = 1_000_000
 
 
-def import_open3d() -> Any:
-    """Import Open3D, lending it the libusb of the wheel ``libusb-package`` where the system has none.
+def _embree() -> tuple[Any, Any]:
+    """Return the binding's modules of scenes and of meshes.
 
     Raises:
-        MissingPartError: if Open3D or a system library it needs is not installed.
+        MissingPartError: if ``embreex`` cannot be imported.
 
     """
     try:
-        import open3d
-    except ImportError:
-        try:
-            import libusb_package
-
-            ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-            import open3d
-        except (ImportError, OSError) as error:
-            raise MissingPartError(
-                f"the simulator needs Open3D, which cannot be loaded ({error}); "
-                "run 'pip install open3d libusb-package', or install the named system library"
-            ) from error
-    return open3d
+        from embreex import mesh_construction, rtcore_scene
+    except ImportError as error:
+        raise MissingPartError(
+            f"the simulator needs embreex, which cannot be imported ({error}); "
+            "run pip install 'mtpcr-geo[benchmark]'"
+        ) from error
+    return rtcore_scene, mesh_construction
 
 
 @dataclass(frozen=True)
@@ -61,15 +54,18 @@ class Caster:
     Args:
         mesh: what can be hit.
 
+    Raises:
+        MissingPartError: if ``embreex`` is not installed.
+
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        self._o3d = import_open3d()
+        scenes, meshes = _embree()
         self._material = mesh.material
-        tensor = self._o3d.core.Tensor
-        self._scene = self._o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(
-            tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32))
+        self._scene = scenes.EmbreeScene(robust=True)
+        # held, since Embree refers to it
+        self._mesh = meshes.TriangleMesh(
+            self._scene, mesh.vertices.astype(np.float32), mesh.triangles.astype(np.int32)
         )
 
     def cast(self, origins: Floats, directions: Floats) -> Hits:
@@ -86,10 +82,12 @@ class Caster:
         normal = np.empty((n, 3))
         for start in range(0, n, BATCH_RAYS):
             part = slice(start, min(start + BATCH_RAYS, n))
-            rays = np.concatenate([origins[part], directions[part]], axis=1).astype(np.float32)
-            answer = self._scene.cast_rays(self._o3d.core.Tensor(rays))
-            distance[part] = answer["t_hit"].numpy()
-            ids = answer["primitive_ids"].numpy()
-            material[part] = self._material[np.minimum(ids, len(self._material) - 1)]
-            normal[part] = answer["primitive_normals"].numpy()
+            rays = (np.ascontiguousarray(side[part], np.float32) for side in (origins, directions))
+            answer = self._scene.run(*rays, query="INTERSECT", output=True)
+            triangle = answer["primID"]
+            missed = triangle < 0
+            distance[part] = np.where(missed, np.inf, answer["tfar"])
+            material[part] = self._material[np.where(missed, 0, triangle)]
+            across = np.where(missed[:, None], (0.0, 0.0, 1.0), answer["Ng"].astype(np.float64))
+            normal[part] = across / np.linalg.norm(across, axis=1, keepdims=True)
         return Hits(distance, material, normal)

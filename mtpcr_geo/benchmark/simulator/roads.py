@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-Floats = NDArray[np.float64]
+from mtpcr_geo.core.arrays import Floats, Indices, Mask
+
 STEP_M = 1.0
 
 
@@ -47,7 +47,7 @@ class Network:
     """
 
     nodes: Floats
-    edges: NDArray[np.int64]
+    edges: Indices
     lines: tuple[Floats, ...]
     widths: Floats
 
@@ -68,7 +68,7 @@ class Network:
                 return line[::-1]
         raise ValueError(f"no road joins nodes {a} and {b}")
 
-    def walk(self, allowed: NDArray[np.bool_], start: int, end: int, length: float) -> Floats:
+    def walk(self, allowed: Mask, start: int, end: int, length: float) -> Floats:
         """Walk along roads as one who maps a quarter: the nearest street not yet seen comes next.
 
         Args:

@@ -11,22 +11,20 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.simulator.instruments import Beams
-
-Floats = NDArray[np.float64]
+from mtpcr_geo.core.arrays import Floats, Mask
 
 
 class HeightAt(Protocol):
-    """Gives the ground's height in metres at (n, 2) positions."""
+    """A function that gives the ground's height in metres at (n, 2) positions."""
 
     def __call__(self, xy: Floats) -> Floats:
         """Return (n,) metres."""
 
 
 def _drift(time: Floats, size: float, period: float, rng: np.random.Generator) -> Floats:
-    """Draw a smooth error of place, (n, 3) metres with standard deviation `size`, about 0 on the whole."""
+    """Draw a smooth position error, (n, 3) metres with standard deviation `size`, about 0 on the whole."""
     if not len(time) or size <= 0:
         return np.zeros((len(time), 3))
     knots = max(4, int(np.ceil(np.ptp(time) / period)) + 3)
@@ -76,7 +74,7 @@ def robot_beams(
         low_deg: elevation of the lowest ring, degrees.
         high_deg: elevation of the highest ring, degrees.
         rings: number of rings.
-        drift_m: standard deviation of the robot's error of place, metres.
+        drift_m: standard deviation of the robot's position error, metres.
 
     """
     s = np.sort(rng.uniform(0, path_length(path), count))
@@ -148,14 +146,14 @@ class Block:
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         return np.asarray(xy @ np.array([[c, s], [-s, c]]))
 
-    def contains(self, xy: Floats) -> NDArray[np.bool_]:
-        """Say which (n, 2) site places lie in the block."""
+    def contains(self, xy: Floats) -> Mask:
+        """Return which (n, 2) site positions lie in the block."""
         uv = self.to_block(xy)
         return np.asarray(((uv >= self.low) & (uv < self.high)).all(axis=1))
 
     @property
     def area(self) -> float:
-        """Square metres."""
+        """Return the area, square metres."""
         return float(np.prod(self.high - self.low))
 
 

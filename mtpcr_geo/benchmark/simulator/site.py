@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from mtpcr_geo.benchmark.simulator.furniture import add_car, add_poles, add_traffic, add_walker
@@ -15,8 +14,8 @@ from mtpcr_geo.benchmark.simulator.mesh import Frame, Mesh, MeshBuilder
 from mtpcr_geo.benchmark.simulator.roads import Network, make_network
 from mtpcr_geo.benchmark.simulator.terrain import Ground, make_ground, relief
 from mtpcr_geo.benchmark.simulator.vegetation import Plants, Species, add_plants
+from mtpcr_geo.core.arrays import Floats, Indices
 
-Floats = NDArray[np.float64]
 MARGIN_M = 25.0
 # shares of the buildings that are pulled down, and put up, after the first epoch
 RAZED, RAISED = 0.02, 0.02
@@ -160,7 +159,7 @@ def _pass_by(site: Site, out: MeshBuilder, rng: np.random.Generator) -> None:
             add_traffic(out, [Frame(*place) for place in places], rng)
 
 
-def _stretch(count: int, length: int, every: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def _stretch(count: int, length: int, every: int, rng: np.random.Generator) -> Indices:
     """Draw a part of a road: numbers of its points."""
     start = int(rng.integers(0, max(1, count - length)))
     return np.arange(start, min(start + length, count), every)

@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 
 from mtpcr_geo.benchmark.simulator.mesh import Material, Mesh
 from mtpcr_geo.benchmark.simulator.roads import Network
-
-Floats = NDArray[np.float64]
+from mtpcr_geo.core.arrays import Floats
 
 
 def relief(

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.simulator.mesh import Material, MeshBuilder
+from mtpcr_geo.core.arrays import Floats, Indices
 
-Floats = NDArray[np.float64]
 VARIANTS = 6
 _KEYS = 100_003
 
@@ -73,7 +72,7 @@ class Plants:
 
     xy: Floats
     height: Floats
-    species: NDArray[np.int64]
+    species: Indices
 
     @classmethod
     def empty(cls) -> Plants:
@@ -161,7 +160,7 @@ def _place(
     template: Floats,
     form: Form,
     plants: Plants,
-    chosen: NDArray[np.int64],
+    chosen: Indices,
     ground_z: Floats,
     kept: Floats,
     rng: np.random.Generator,

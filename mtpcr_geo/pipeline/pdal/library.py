@@ -99,18 +99,22 @@ def pipeline(stages: Sequence[Mapping[str, Any]]) -> Any:
 def arrays_of(iterator: Any) -> Iterator[NDArray[np.void]]:
     """Yield the arrays of python-pdal's streaming iterator, without being caught in its end.
 
-    Its worker thread marks the end (``PythonPointTable::done``, up to 3.5.5 at least) without the lock that
-    its consumer looks under: who looks just then misses the mark and waits for ever, some once in a
-    thousand streams. After its last array the worker needs a fraction of a millisecond; so each array is
-    followed by a pause long enough for the mark to be there, and short beside reading a full array.
+    Its worker thread marks the end (``PythonPointTable::done``, up to 3.5.5 at least) without the lock
+    under which its consumer looks for the mark: who looks in that very moment misses it and waits for
+    ever, some once in a thousand streams whose consumer asks at once. Nothing in Python shows whether
+    another array will come, and a wait inside PDAL cannot be ended; but the mark follows the last array
+    by a fraction of a millisecond. So the next array is asked for no sooner than 10 ms after the last one
+    came. What the caller does with an array takes that long where arrays are large, and then no time is
+    lost.
     """
     for records in iterator:
+        earliest = time.monotonic() + _SETTLE_S
         yield records
-        time.sleep(_SETTLE_S)
+        time.sleep(max(0.0, earliest - time.monotonic()))
 
 
 def problem_of(stages: Sequence[Mapping[str, Any]]) -> str | None:
-    """Let PDAL prepare stages without running them, and give what it says against them, if anything.
+    """Let PDAL prepare stages without running them, and return its first complaint, or None.
 
     Preparing reads the options and the headers of inputs; no point is read and no file is written.
     """

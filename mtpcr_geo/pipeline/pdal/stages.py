@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,15 +9,14 @@ from typing import Any
 from pydantic import ConfigDict
 
 from mtpcr_geo.core.cloud import Cloud
-from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError, OutputError
+from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.suggestions import meant
 from mtpcr_geo.pipeline.grammar import StageSpec, file_of
 from mtpcr_geo.pipeline.pdal import library
-from mtpcr_geo.pipeline.pdal.cloud import PdalCloud, Step
+from mtpcr_geo.pipeline.pdal.cloud import PdalCloud
+from mtpcr_geo.pipeline.pdal.step import Step, failure, file_written, is_reader, stage_json
 from mtpcr_geo.pipeline.stage import RunContext, Stage, StageOptions, Value
 
-# the name under which a file is written until the run is whole
-_PASSING = re.compile(r"\.([^/\\]+)\.part-\d+(\.\w+)")
 _NO_POINTS = {"type": "readers.faux", "count": 1, "mode": "constant", "bounds": "([0, 1], [0, 1], [0, 1])"}
 
 
@@ -49,29 +47,16 @@ class PdalStage(Stage):
         self.for_us = False
         self.upstream: Sequence[Stage] = ()
         self.stand_in: Path | None = None
-        self.written = False
 
     def reads(self) -> list[Path]:
         """Name the file of a reader."""
         name = file_of(self.spec.options)
-        return [Path(name)] if self.is_reader and name and "://" not in name else []
+        return [Path(name)] if is_reader(self.spec) and name and "://" not in name else []
 
     def writes(self) -> list[Path]:
         """Name the file of a writer; one with a # becomes one file a view, known only when written."""
-        name = file_of(self.spec.options)
-        if not self.is_writer or not name:
-            return []
-        return [Path(name)] if "#" not in name else []
-
-    @property
-    def is_reader(self) -> bool:
-        """Return whether it starts a chain."""
-        return self.spec.type.startswith("readers.")
-
-    @property
-    def is_writer(self) -> bool:
-        """Return whether it leaves a file."""
-        return self.spec.type.startswith("writers.")
+        file = file_written(self.spec)
+        return [file] if file is not None else []
 
     def check(self, context: RunContext) -> None:
         """Let PDAL prepare everything up to this stage, without running it."""
@@ -80,7 +65,7 @@ class PdalStage(Stage):
         problem = library.problem_of(list(chain.values()))
         # without the true cloud, PDAL cannot know which dimensions there will be
         if problem and not (guessed and "dimension" in problem.lower()):
-            raise self.failed(problem, preparing=True)
+            raise failure(self.spec, problem, preparing=True)
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Join the chain; at its end, run it all in PDAL."""
@@ -92,17 +77,9 @@ class PdalStage(Stage):
             cloud.evaluate(context, need_crs=self.for_us)
         return cloud
 
-    def failed(self, message: str, *, preparing: bool = False) -> MtpcrError:
-        """Put what PDAL says in one line that names this stage."""
-        detail = _PASSING.sub(r"\1\2", message.removeprefix(f"{self.spec.type}: "))
-        text = f"{self.label}: PDAL says: {detail}"
-        if "argument" in detail or (preparing and not self.is_reader):
-            return OptionError(text)
-        return OutputError(text) if self.is_writer else InputError(text)
-
     def _step(self, inputs: Sequence[Cloud]) -> Step:
         before = tuple(given.step if isinstance(given, PdalCloud) else given for given in inputs)
-        return Step(self, before)
+        return Step(self.spec, before, self.metadata)
 
     def _prepared(self, chain: dict[str, dict[str, Any]]) -> bool:
         """Add this stage and all before it to a chain for PDAL; say whether a cloud had to be guessed."""
@@ -118,14 +95,8 @@ class PdalStage(Stage):
                 guessed = True
                 chain[stage.tag] = {**_NO_POINTS, "tag": stage.tag}
             inputs.append(stage.tag)
-        chain[self.tag] = pdal_words(self.spec, inputs)
+        chain[self.tag] = stage_json(self.spec, inputs)
         return guessed
-
-
-def pdal_words(spec: StageSpec, inputs: Sequence[str], **changed: Any) -> dict[str, Any]:
-    """Put a stage in PDAL's JSON."""
-    words = {**spec.options, **changed, "type": spec.type, "tag": spec.tag}
-    return {**words, "inputs": list(inputs)} if inputs else words
 
 
 def make_pdal_stage(spec: StageSpec) -> PdalStage:
@@ -142,8 +113,8 @@ def make_pdal_stage(spec: StageSpec) -> PdalStage:
     for name in spec.options:
         if known and name not in known:
             raise OptionError(f"{spec.label}: no option {name!r}{meant(name, known)}")
-    words: Mapping[str, Any] = {key: value for key, value in spec.options.items() if key != "user_data"}
+    options: Mapping[str, Any] = {key: value for key, value in spec.options.items() if key != "user_data"}
     # every PDAL stage has a class of its own, so that its type is a class attribute as everywhere
     kind = type("PdalStage", (PdalStage,), {"type": spec.type, "__doc__": drivers[spec.type].description})
-    stage: PdalStage = kind(PdalOptions.model_validate(words), spec)
+    stage: PdalStage = kind(PdalOptions.model_validate(options), spec)
     return stage

@@ -15,7 +15,7 @@ from mtpcr_geo.core.system import peak_memory_mb
 from mtpcr_geo.core.types import Pair, Side, Verdict
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.pipeline.options import Force
-from mtpcr_geo.pipeline.stage import RunContext, Stage, StageOptions, Value
+from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 
 TransformFormat = Literal["json", "cloudcompare", "pdal"]
 
@@ -27,7 +27,7 @@ class ApplyOptions(StageOptions):
 
 
 class Apply(Stage):
-    """Move the source to the target: hands on the moved cloud, or nothing when the verdict is refused."""
+    """Move the source to the target; nothing comes out when the verdict is refused."""
 
     type = "mtpcr.apply"
     Options = ApplyOptions
@@ -35,15 +35,15 @@ class Apply(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Return the source's points in the target's CRS and units, streamed on demand."""
-        from mtpcr_geo.io.views import Moved
+        from mtpcr_geo.io.views import moved_source
 
         pair = self.one_pair(inputs)
         if pair.T_target_source is None:
             raise OptionError(f"{self.label} needs a solved pair; put mtpcr.solve before it")
-        if refused(pair) and not (self.options.force or context.force):
+        if refused(pair) and not self.options.force:
             self.metadata["skipped"] = "the verdict is refused"
             return None
-        return Moved(pair)
+        return moved_source(pair)
 
 
 class FileOptions(StageOptions):
@@ -56,7 +56,7 @@ class EvidenceWriter(Stage):
     """Writes what there is of a pair, and hands it on; has nothing to do where there is no pair."""
 
     evidence = True
-    Options = FileOptions
+    Options: ClassVar[OptionsModel] = FileOptions
     options: FileOptions
 
     def writes(self) -> list[Path]:
@@ -81,8 +81,17 @@ class EvidenceWriter(Stage):
         return None
 
     def write(self, pair: Pair, context: RunContext) -> None:
-        """Write the file under its passing name."""
+        """Write the file under its temporary name."""
         raise NotImplementedError
+
+
+class BevFileOptions(FileOptions):
+    """Options of mtpcr.write_bev."""
+
+    filename: Path = Field(
+        description="file to write; a # in it stands for 'source', 'target' and, once the pair is "
+        "solved, 'registered': the source's raster laid over the target's"
+    )
 
 
 class WriteBev(EvidenceWriter):
@@ -90,13 +99,7 @@ class WriteBev(EvidenceWriter):
 
     type: ClassVar[str] = "mtpcr.write_bev"
 
-    class Options(FileOptions):
-        """Options of mtpcr.write_bev."""
-
-        filename: Path = Field(
-            description="file to write; a # in it stands for 'source', 'target' and, once the pair is "
-            "solved, 'registered': the source's raster laid over the target's"
-        )
+    Options: ClassVar[OptionsModel] = BevFileOptions
 
     def writes(self) -> list[Path]:
         """Name both files, or the one."""
@@ -146,26 +149,30 @@ class WriteTiePoints(EvidenceWriter):
         write_tie_points(context.outputs.path(self.options.filename), pair)
 
 
+class TransformFileOptions(FileOptions):
+    """Options of mtpcr.write_transform."""
+
+    format: TransformFormat | None = Field(
+        None,
+        description="json for mtpcr-geo apply, a cloudcompare matrix, or a pdal pipeline; "
+        "where not given, .pdal.json means pdal, .txt means cloudcompare, all else json",
+    )
+    force: Force = False
+
+
 class WriteTransform(EvidenceWriter):
-    """Write the transform; held out when the verdict is refused."""
+    """Write the transform; not written when the verdict is refused."""
 
     type: ClassVar[str] = "mtpcr.write_transform"
 
-    class Options(FileOptions):
-        """Options of mtpcr.write_transform."""
-
-        format: TransformFormat | None = Field(
-            None,
-            description="json for mtpcr-geo apply, a cloudcompare matrix, or a pdal pipeline; "
-            "where not given, .pdal.json means pdal, .txt means cloudcompare, all else json",
-        )
-        force: Force = False
+    Options: ClassVar[OptionsModel] = TransformFileOptions
+    options: TransformFileOptions
 
     def missing(self, pair: Pair, context: RunContext) -> str | None:
         """Need a transform that was not refused."""
         if pair.T_target_source is None:
             return "no transform was found"
-        if refused(pair) and not (context.force or getattr(self.options, "force", False)):
+        if refused(pair) and not self.options.force:
             return "the verdict is refused"
         return None
 
@@ -187,12 +194,11 @@ class WriteTransform(EvidenceWriter):
     @property
     def format(self) -> TransformFormat:
         """The format, by option or by the file's name."""
-        given: TransformFormat | None = getattr(self.options, "format", None)
         name = self.options.filename.name.lower()
         by_name: TransformFormat = (
             "pdal" if name.endswith(".pdal.json") else "cloudcompare" if name.endswith(".txt") else "json"
         )
-        return given or by_name
+        return self.options.format or by_name
 
 
 class WriteRecording(EvidenceWriter):
@@ -206,8 +212,6 @@ class WriteRecording(EvidenceWriter):
 
     def open(self, context: RunContext) -> None:
         """Put a recorder in place before the first stage runs."""
-        if not context.facts.get("recording", True):
-            return
         if not isinstance(context.recorder, NullRecorder):
             raise OptionError(f"{self.label}: a run keeps one recording; remove the second")
         from mtpcr_geo.export.recording.recorder import RerunRecorder
@@ -215,7 +219,7 @@ class WriteRecording(EvidenceWriter):
         context.recorder = RerunRecorder(context.outputs.path(self.options.filename))
 
     def write(self, pair: Pair, context: RunContext) -> None:
-        """Nothing to do here: the recorder hears of every stage."""
+        """Do nothing here: the recorder is told of every stage as it ends."""
 
 
 class WriteReport(EvidenceWriter):
@@ -228,7 +232,8 @@ class WriteReport(EvidenceWriter):
         """Write the HTML."""
         from mtpcr_geo.export.report.page import write_report
 
-        write_report(context.outputs.path(self.options.filename), pair, context.done, context.facts)
+        done = [record.audit() for record in context.done]
+        write_report(context.outputs.path(self.options.filename), pair, done, context.facts.audit())
 
 
 class WriteRun(EvidenceWriter):
@@ -259,22 +264,23 @@ def run_facts(pair: Pair | None, context: RunContext) -> dict[str, Any]:
         verdict = Verdict("refused", (context.failure,), {})
     from mtpcr_geo.export.transform import frames_of
 
-    seconds = {entry["tag"]: round(entry["seconds"], 4) for entry in context.done}
+    facts = context.facts.audit()
+    seconds = {record.tag: round(record.seconds, 4) for record in context.done}
     return {
         "verdict": verdict.name if verdict else None,
         "reasons": list(verdict.reasons) if verdict else [],
         "metrics": verdict.metrics if verdict else {},
-        # found, which says nothing of whether to use it: that is the verdict
+        # whether to use it is the verdict's to say
         "T_target_source": TransformChain.of(pair).T_file
         if pair is not None and pair.T_target_source is not None
         else None,
         "frames": frames_of(pair) if pair is not None else None,
-        "time_s": {**seconds, "total": round(time.perf_counter() - context.facts["started"], 4)},
+        "time_s": {**seconds, "total": round(time.perf_counter() - context.facts.started, 4)},
         "peak_memory_mb": peak_memory_mb(),
-        "options": {entry["tag"]: entry["options"] for entry in context.done},
-        "stages": context.done,
-        "pipeline": context.facts["pipeline"],
-        "versions": context.facts.get("versions", {}),
-        "inputs": context.facts.get("inputs", []),
+        "options": {record.tag: record.options for record in context.done},
+        "stages": [record.audit() for record in context.done],
+        "pipeline": facts["pipeline"],
+        "versions": facts["versions"],
+        "inputs": facts["inputs"],
         "outputs": [str(path) for path in context.outputs.written()],
     }

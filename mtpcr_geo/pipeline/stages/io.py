@@ -60,9 +60,15 @@ class LasReader(Stage):
         """Open the header, and read the CRS options."""
         self._open()
 
+    def preview(self, context: RunContext) -> Value | None:
+        """Return the whole cloud, known by its header."""
+        return self._open()
+
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
-        """Return the cloud, known by its header."""
+        """Return the cloud, known by its header; cut short where a count is given."""
         cloud = self._open()
+        if self.options.count is not None and self.options.count < cloud.count:
+            cloud = Head(cloud, self.options.count)
         self.metadata |= {
             "filename": str(self.options.filename),
             "count": cloud.count,
@@ -80,8 +86,6 @@ class LasReader(Stage):
         cloud: Cloud = open_cloud(self.options.filename, override)
         if cloud.crs is None and default is not None:
             cloud = open_cloud(self.options.filename, default)
-        if self.options.count is not None and self.options.count < cloud.count:
-            cloud = Head(cloud, self.options.count)
         return cloud
 
 
@@ -158,11 +162,11 @@ class LasWriterOptions(StageOptions):
 
     @model_validator(mode="before")
     @classmethod
-    def _plain(cls, words: Any) -> Any:
-        compression = words.get("compression") if isinstance(words, dict) else None
+    def _plain(cls, options: Any) -> Any:
+        compression = options.get("compression") if isinstance(options, dict) else None
         if isinstance(compression, bool):
-            return {**words, "compression": str(compression).lower()}
-        return words
+            return {**options, "compression": str(compression).lower()}
+        return options
 
     @model_validator(mode="after")
     def _check(self) -> LasWriterOptions:

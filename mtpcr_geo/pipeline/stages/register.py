@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from mtpcr_geo.pipeline.options import MethodOptions
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
@@ -27,7 +27,7 @@ class Register(Stage):
 
     def __init__(self, options: StageOptions, tag: str) -> None:
         super().__init__(options, tag)
-        self.steps = [self._step(words) for words in steps_of(self.options)]
+        self.steps = steps_of(self.options, f"{tag}_")
 
     def check(self, context: RunContext) -> None:
         """Check every step."""
@@ -54,10 +54,3 @@ class Register(Stage):
             )
         self.metadata["time_s"] = seconds
         return value
-
-    def _step(self, words: dict[str, Any]) -> Stage:
-        from mtpcr_geo.pipeline.registry import make_options, stage_types
-
-        kind = stage_types()[words["type"]]
-        given = {key: value for key, value in words.items() if key not in ("type", "tag", "inputs")}
-        return kind(make_options(self.label, kind.Options, given), f"{self.tag}_{words['tag']}")
