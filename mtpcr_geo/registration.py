@@ -32,7 +32,7 @@ from mtpcr_geo.pipeline.records import StageRecord
 from mtpcr_geo.pipeline.runner import RunResult, run
 from mtpcr_geo.pipeline.stage import Stage, chained
 from mtpcr_geo.pipeline.stages.memory import MemoryReader
-from mtpcr_geo.pipeline.steps import reader_of, recording_writer, steps_of, writers_of
+from mtpcr_geo.pipeline.stages.steps import reader_of, recording_writer, steps_of, writers_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

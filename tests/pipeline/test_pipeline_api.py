@@ -26,7 +26,7 @@ def types(pipeline: mg.Pipeline) -> list[str]:
 
 
 def test_a_path_a_text_a_list_and_a_mapping_are_one_pipeline(town_files, tmp_path):
-    stages = [str(town_files[1]), {"type": "filters.crop", "bounds": "([0, 1], [0, 1])"}]
+    stages: list[Any] = [str(town_files[1]), {"type": "filters.crop", "bounds": "([0, 1], [0, 1])"}]
     text = json.dumps(stages)
     file = tmp_path / "mine.json"
     file.write_text("// a comment\n" + text, encoding="utf-8")
