@@ -32,7 +32,7 @@ from mtpcr_geo.pipeline.records import StageRecord
 from mtpcr_geo.pipeline.runner import RunResult, run
 from mtpcr_geo.pipeline.stage import Stage, chained
 from mtpcr_geo.pipeline.stages.memory import MemoryReader
-from mtpcr_geo.pipeline.steps import reader_of, recording_writer, steps_of, writers_of
+from mtpcr_geo.pipeline.stages.steps import reader_of, recording_writer, steps_of, writers_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -151,7 +151,9 @@ class Registration:
         try:
             from mtpcr_geo.export.figure import registration_figure
         except ImportError as error:
-            raise MissingPartError(f"plot() needs matplotlib ({error}): pip install matplotlib") from error
+            raise MissingPartError(
+                f'plot() needs matplotlib ({error}): pip install "mtpcr-geo[plot]"'
+            ) from error
         if self.pair is None or self.pair.source.bev is None or self.pair.target.bev is None:
             raise RegistrationError(f"there is nothing to plot: {'; '.join(self.verdict.reasons)}")
         names = " to ".join(Path(side.cloud.name).name for side in (self.pair.source, self.pair.target))

@@ -1,4 +1,4 @@
-"""What the benchmark asks of a method, and which methods there are.
+"""Which methods the benchmark has, and how one is made from its name.
 
 A method is named on the command line by its name and, after a colon, its options:
 ``fpfh-ransac:voxel=1.5,icp=false``. The label in the tables is that text.
@@ -10,52 +10,13 @@ import importlib
 import importlib.util
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from dataclasses import dataclass
+from typing import Any
 
 from mtpcr_geo.benchmark.baselines.open3d import import_open3d
-from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.benchmark.estimate import Method
 from mtpcr_geo.core.errors import MissingPartError, OptionError
 from mtpcr_geo.core.suggestions import meant
-
-Judgement = Literal["accepted", "doubtful", "refused", "unjudged"]
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What a method answers.
-
-    Attributes:
-        T_target_source: 4x4, or None where it found nothing.
-        verdict: its own; "unjudged" from a method without one.
-        reason: why it refuses or doubts, or its message.
-        details: numbers worth keeping with the run.
-        memory_mib: peak memory where the method ran elsewhere; else it is measured around the call.
-
-    """
-
-    T_target_source: Floats | None
-    verdict: Judgement = "unjudged"
-    reason: str = ""
-    details: dict[str, Any] = field(default_factory=dict)
-    memory_mib: float | None = None
-
-
-class Method(Protocol):
-    """A method under test."""
-
-    def estimate(self, source: Floats, target: Floats, *, seed: int) -> Estimate:
-        """Find the transform.
-
-        Args:
-            source: (n, 3) float64, metres, somewhere; z about up.
-            target: (m, 3) float64, metres, about the origin; z up.
-            seed: of everything random.
-
-        Raises:
-            MtpcrError: where there is no answer; the run then counts as one without.
-
-        """
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mtpcr_geo.benchmark.methods import Estimate
+from mtpcr_geo.benchmark.estimate import Estimate
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import RegistrationError

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from mtpcr_geo.benchmark.methods import Estimate, Method, load_libraries, make_method
+from mtpcr_geo.benchmark.estimate import Estimate, Method
+from mtpcr_geo.benchmark.methods import load_libraries, make_method
 from mtpcr_geo.benchmark.metrics import overlap_ratios, pose_errors
 from mtpcr_geo.benchmark.pairs import BenchmarkPair, load_pair
 from mtpcr_geo.core import transforms

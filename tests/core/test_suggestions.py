@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from mtpcr_geo.core.suggestions import SYNONYMS, edit_distance, meant, nearest, suggestions
@@ -108,7 +108,6 @@ def test_edit_distance(a, b, slips):
     assert edit_distance(a, b) == edit_distance(b, a) == slips
 
 
-@settings(deadline=None)
 @given(
     st.text(alphabet="abcde-_.", max_size=12), st.lists(st.text(alphabet="abcde-", min_size=1), max_size=8)
 )

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.benchmark.baselines.open3d import import_open3d
-from mtpcr_geo.benchmark.methods import Estimate
+from mtpcr_geo.benchmark.estimate import Estimate
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats, Indices
 

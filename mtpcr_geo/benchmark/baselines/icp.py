@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mtpcr_geo.benchmark.methods import Estimate
+from mtpcr_geo.benchmark.estimate import Estimate
 from mtpcr_geo.core.arrays import Floats
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mtpcr_geo.benchmark.baselines.fpfh import Features, PrunedFpfhMethod
-from mtpcr_geo.benchmark.methods import Estimate
+from mtpcr_geo.benchmark.estimate import Estimate
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats, Indices
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from mtpcr_geo.benchmark.baselines.fpfh import Features, PrunedFpfhMethod
-from mtpcr_geo.benchmark.methods import Estimate
+from mtpcr_geo.benchmark.estimate import Estimate
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Indices
 

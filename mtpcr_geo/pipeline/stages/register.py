@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from mtpcr_geo.pipeline.options import MethodOptions
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
-from mtpcr_geo.pipeline.steps import steps_of
+from mtpcr_geo.pipeline.stages.steps import steps_of
 
 
 class RegisterStageOptions(MethodOptions, StageOptions):
