@@ -18,6 +18,7 @@ OVERLAP_CELL_M = 2.0
 LOW_RADIUS_M = 6.0
 LOW_ABOVE_M = 0.7
 SLOPE_RADIUS_M = 8.0
+GROUND_LAYER_M = 0.3
 STEEPEST = 1.0
 """Slope, rise over run, beyond which steps count as walls and not as ground."""
 
@@ -30,6 +31,7 @@ class Overlap:
         grid: the common grid.
         source, target: their rasters.
         shared: (h, w) cells that both fill, or that lie within one cell of both.
+        points: both clouds, (n, 3) and (m, 3) metres.
 
     """
 
@@ -37,6 +39,7 @@ class Overlap:
     source: Bev
     target: Bev
     shared: Mask
+    points: tuple[Floats, Floats]
 
     @property
     def area_m2(self) -> float:
@@ -57,7 +60,7 @@ class Overlap:
         return found
 
     def ground_steps(self) -> tuple[Floats, Floats]:
-        """Compare lowest heights where both look at the ground.
+        """Compare the heights of the ground where both see it.
 
         Cells count whose lowest points lie low among their neighbours in both clouds: not on roofs, not
         in crowns.
@@ -70,7 +73,10 @@ class Overlap:
         both &= _lies_low(self.source.low, self.grid.cell) & _lies_low(self.target.low, self.grid.cell)
         row, column = np.nonzero(both)
         xy = self.grid.to_metres(np.column_stack([column, row]).astype(np.float64))
-        step = (self.target.low - self.source.low)[both].astype(np.float64)
+        heights = [
+            _ground(xyz, bev) for xyz, bev in zip(self.points, (self.source, self.target), strict=True)
+        ]
+        step = (heights[1] - heights[0])[both]
         return xy, step
 
 
@@ -91,7 +97,26 @@ def overlap_of(
     s, t = rasterise([source], grid), rasterise([target], grid)
     window = np.ones((2 * margin_cells + 1, 2 * margin_cells + 1), np.uint8)
     near = [cv2.dilate((bev.count > 0).astype(np.uint8), window) > 0 for bev in (s, t)]
-    return Overlap(grid, s, t, near[0] & near[1])
+    return Overlap(grid, s, t, near[0] & near[1], (source, target))
+
+
+def _ground(xyz: Floats, bev: Bev) -> Floats:
+    """Return the mean height of the lowest layer of each cell, (h, w) metres, NaN where empty.
+
+    The single lowest point lies the lower the denser and the noisier a cloud is; the mean of what lies
+    little above it does not.
+    """
+    grid = bev.grid
+    column, row = grid.cells(xyz)
+    inside = grid.holds(column, row)
+    cell, z = row[inside] * grid.width + column[inside], xyz[inside, 2]
+    low = bev.low.ravel()[cell]
+    layer = z - low <= GROUND_LAYER_M
+    size = grid.width * grid.height
+    count = np.bincount(cell[layer], minlength=size)
+    total = np.bincount(cell[layer], (z - low)[layer], minlength=size)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(bev.low.astype(np.float64) + (total / count).reshape(grid.shape))
 
 
 def _lies_low(low: NDArray[np.float32], cell: float, above: float = LOW_ABOVE_M) -> Mask:

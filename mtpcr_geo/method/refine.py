@@ -22,13 +22,15 @@ CORRELATED_CELLS = 50
 GROUND_NOISE_M = 0.5
 LEVEL_SIGMA_DEG = 1.0
 SCATTER_SHARE, SCATTER_M = 0.5, 0.03
-FINE_SPACINGS = 2.0
+FINE_SPACINGS = 4.0
 """Voxel of the last round in mean distances between points of the sparser cloud."""
-FINEST_VOXEL_M = 0.1
+FINEST_VOXEL_M = 0.2
 FINE_BELOW = 0.75
 """Share of the thinning before below which a last, finer round is worth its time."""
 FINE_DISTANCE_VOXELS = 2.0
 FINE_POINTS = 2
+SAME_FIT = 1.02
+"""Times that the surface residual may grow where the height is taken from the ground after ICP."""
 CLEARLY = 1.01
 """Times that the residual after ICP must exceed a start's for the start to be taken: on bare, sparse ground
 they are equal but for chance, and results would jump with it."""
@@ -90,6 +92,7 @@ def refine(
 
     """
     T, ground_before, icp, ground_after = T_start, None, None, None
+    surfaces: Surfaces | None = None
     starts = {"tie_points": T}
     ground_cell = ground_cell_for(cell)
     if settings.ground:
@@ -120,12 +123,16 @@ def refine(
         T = icp.T
         fine = _refined_finely(source, target, T, settings, agreeing) if icp.followed else None
         if fine is not None:
-            icp = replace(icp, T=fine.T, fine=fine.round_, fine_voxel_m=fine.voxel_m)
-            T = fine.T
+            icp = replace(icp, T=fine.T, fine=fine.round_, fine_voxel_m=fine.surfaces.voxel_m)
+            T, surfaces = fine.T, fine.surfaces
     if settings.ground:
         ground_after = settle_on_ground(source, target, T, tilt=False, cell=ground_cell)
-        ground_after = replace(ground_after, followed=settings.method is None or beyond_scatter(ground_after))
-        T = ground_after.T if ground_after.followed else T
+        followed = surfaces is None or (
+            beyond_scatter(ground_after)
+            and surfaces.surface_residual(ground_after.T) <= SAME_FIT * surfaces.surface_residual(T)
+        )
+        ground_after = replace(ground_after, followed=followed)
+        T = ground_after.T if followed else T
     if settings.motion != "rigid":
         middle = source.mean(axis=0) if pivot is None else pivot
         T = constrain(T, settings.motion, middle, np.eye(3) if R_upright is None else R_upright)
@@ -136,7 +143,7 @@ def refine(
 class _Fine:
     T: Floats
     round_: IcpRound
-    voxel_m: float
+    surfaces: Surfaces
 
 
 def _refined_finely(
@@ -169,7 +176,7 @@ def _refined_finely(
         return None
     if agreeing(run.T) < settings.keep_tie_points * agreeing(T_start):
         return None
-    return _Fine(run.T, run.rounds[-1], voxel)
+    return _Fine(run.T, run.rounds[-1], surfaces)
 
 
 def fine_voxel(source: Floats, target: Floats, T: Floats) -> float:

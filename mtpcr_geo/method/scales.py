@@ -1,15 +1,15 @@
 """Lengths that follow from the data: density, extent and overlap decide, between limits written down here.
 
 No length in metres decides anything by itself: a plot of 20 m and a tile of kilometres go through the same
-rules. Cells are chosen by `mtpcr_geo.method.bev.choose_cell`, the rest here. The extent that counts is that of
-the smaller cloud, as the edge of a square of its occupied area.
+rules. Cells are chosen by `mtpcr_geo.method.bev.choose_cell`, the rest here. The extent that counts is that
+of the smaller cloud, as the edge of a square of its occupied area.
 
 ==================  =======================================  ===============
 length              rule                                     limits
 ==================  =======================================  ===============
 cell                so that a cell of the sparser cloud      0.25 to 8 m
                     holds 1.2 points, but no finer than
-                    1/200 of the extent, up to 1 m
+                    1/200 of the extent, or 1 m
 patch               1/4 of the extent, at least 12 cells     at most 24 m
 search radius       1/4 of a patch, at least 3 cells         at most 6 m
 block               1/5 of the tie points' extent,           at most 40 m
