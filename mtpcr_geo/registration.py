@@ -151,7 +151,9 @@ class Registration:
         try:
             from mtpcr_geo.export.figure import registration_figure
         except ImportError as error:
-            raise MissingPartError(f"plot() needs matplotlib ({error}): pip install matplotlib") from error
+            raise MissingPartError(
+                f'plot() needs matplotlib ({error}): pip install "mtpcr-geo[plot]"'
+            ) from error
         if self.pair is None or self.pair.source.bev is None or self.pair.target.bev is None:
             raise RegistrationError(f"there is nothing to plot: {'; '.join(self.verdict.reasons)}")
         names = " to ".join(Path(side.cloud.name).name for side in (self.pair.source, self.pair.target))

@@ -77,6 +77,9 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``readers.las minimum``: least coordinates by its header
 - ``readers.las maximum``: greatest coordinates by its header
 - ``readers.las srs``: its CRS as WKT, or empty
+- ``readers.memory name``: what a cloud given from Python is called
+- ``readers.memory count``: its points
+- ``readers.memory srs``: its CRS as WKT, or empty
 - ``mtpcr.level <role>.points``: points read
 - ``mtpcr.level <role>.noise_points``: of these, classified as noise (7, 18) or flagged withheld, and left
   out
