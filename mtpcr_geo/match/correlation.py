@@ -52,6 +52,8 @@ RADIUS_TOLERANCES = 4.0
 """How far the final patch matches may lie from where the pose puts them, tolerances."""
 AGREE_TOLERANCES = 1.5
 MAX_RADIUS_CELLS = 10
+ESTIMATE_CELLS = 20_000.0
+"""Cells that tell which yaw and shift fit best on the way down to the finest level."""
 SAME_YAW_DEG = 5.0
 GROUND_SCALE_M = 0.1
 """Spread of the ground's height differences, beyond the least of all hypotheses, that halves a strength."""
@@ -442,13 +444,17 @@ class _Search:
             source, target = self.pyramid.at(level)
             tries = [
                 score_nearby(
-                    source, target, Pose(pose.yaw + np.radians(k * step), pose.east, pose.north), window
+                    source,
+                    target,
+                    Pose(pose.yaw + np.radians(k * step), pose.east, pose.north),
+                    window,
+                    ESTIMATE_CELLS,
                 )[0]
                 for k in (-2, -1, 0, 1, 2)
             ]
             pose = max(tries, key=lambda p: p.score)
             if level == 1:
-                return Candidate(pose)
+                return Candidate(score_nearby(source, target, pose, 1)[0])
             finer = max(1, level // 2)
             # the centre of the raster moves a little between levels: same pose, other pivot
             hypothesis = pose.hypothesis(centre_of(source.grid))
