@@ -1,8 +1,8 @@
 """From tie points to a rigid transform: iterative SVD with outlier rejection, and a robust start for it.
 
-One SVD over many outliers does not recover, however often it is repeated; with gravity known only a yaw and
-a shift remain, which two tie points determine, so that RANSAC over pairs of tie points finds a start from which
-it does.
+From many outliers the SVD does not recover, however often it is repeated. With the vertical known, only a yaw
+and a shift remain; two tie points determine them, and RANSAC over pairs of tie points finds a start from which
+the SVD does recover.
 """
 
 from __future__ import annotations
@@ -219,7 +219,7 @@ def solve_tie_points(
     weight = np.maximum(tie_points.score[used], 0.05) ** 2
     flat = np.array([1.0, 1.0, 0.0])
     if settings.upright:
-        # heights of single tie points are rough: plan is solved without them, and the height from their median
+        # heights of single tie points are rough: plan is solved without them, height from their median
         solution = iterative_svd(
             s * flat, t * flat, start=start, weight=weight, floor=tolerance, ceiling=ceiling, upright=True
         )
