@@ -1,8 +1,8 @@
 """From tie points to a rigid transform: iterative SVD with outlier rejection, and a robust start for it.
 
 From many outliers the SVD does not recover, however often it is repeated. With the vertical known, only a yaw
-and a shift remain; two tie points determine them, and RANSAC over pairs of tie points finds a start from which
-the SVD does recover.
+and a shift remain; two tie points determine them, so that RANSAC over pairs of tie points finds a start which
+the SVD can improve.
 """
 
 from __future__ import annotations
