@@ -271,6 +271,7 @@ def match(
         margin=pool.margin,
         support=best.support,
         null_ratio=null_ratio,
+        strength=best.strength,
         report=report,
     )
 
