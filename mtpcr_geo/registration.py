@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 class Registration:
-    """What a registration came to.
+    """Result of a registration.
 
     Attributes:
         verdict: accepted, doubtful or refused, with reasons and metrics.
@@ -74,8 +74,8 @@ class Registration:
     def T_target_source(self) -> Floats | None:
         """4x4 on the coordinates as they stand in the inputs, source to target; None if none was found.
 
-        It stands here even when refused: look at the verdict. Where a coordinate operation lies between
-        both, it is the best fit; `apply` goes the exact way.
+        It is given even where the verdict is refused. Where a coordinate operation lies between both clouds,
+        it is the best fit, and `apply` follows the exact chain.
         """
         return None if self._chain is None else self._chain.T_file
 
@@ -94,14 +94,14 @@ class Registration:
 
         Args:
             points: (n, 3) coordinates in the source's CRS and units; or a file, `laspy.LasData` or `Cloud`.
-            force: move them though the verdict is refused.
+            force: move them even if the verdict is refused.
 
         Returns:
             (n, 3) float64 for an array; else a `Cloud` that streams the moved points with all dimensions.
 
         Raises:
             RegistrationError: if no transform was found, or the verdict is refused.
-            InputError: if the points are none.
+            InputError: if `points` is no cloud, or cannot be read.
             CrsError: if a cloud is not in the source's CRS.
 
         """
@@ -112,17 +112,17 @@ class Registration:
     @overload
     def inverse(self, points: ArrayLike, *, force: bool = ...) -> Floats: ...
     def inverse(self, points: CloudLike, *, force: bool = False) -> Floats | Cloud:
-        """Move points from the target's frame to the source's: the way back of `apply`.
+        """Move points from the target's frame to the source's: the inverse of `apply`.
 
         Args and errors are those of `apply`, with source and target exchanged.
         """
         return move(self.chain(force=force), points, inverse=True)
 
     def chain(self, *, force: bool = False) -> TransformChain:
-        """Return the way of a point from source to target coordinates, step by step.
+        """Return the exact chain of transforms from source to target coordinates.
 
         Args:
-            force: return it though the verdict is refused.
+            force: return it even if the verdict is refused.
 
         Raises:
             RegistrationError: if no transform was found, or the verdict is refused.
@@ -176,8 +176,8 @@ class Registration:
         Args:
             folder: made if it is not there.
             overwrite: replace files that are already there.
-            force: write cloud and transform though the verdict is refused.
-            progress: where long work reports.
+            force: write cloud and transform even if the verdict is refused.
+            progress: receives the progress of long steps.
 
         Returns:
             The files written, by what they are, which is also in `outputs`.
@@ -210,7 +210,7 @@ class Registration:
         return f"<div><b>Registration: {escape(self.verdict.name)}</b><table>{rows}</table></div>"
 
     def _rows(self) -> list[tuple[str, str]]:
-        """Return what moves, how, and the reasons of the verdict, as (name, text)."""
+        """Return clouds, transform, overlap and reasons of the verdict, as (name, text)."""
         rows = []
         if self.pair is not None:
             names = (Path(side.cloud.name).name for side in (self.pair.source, self.pair.target))
@@ -249,15 +249,15 @@ def register(
             or a `Cloud`.
         target: the cloud that stays, likewise.
         out: folder for the result and its evidence; made if it is not there.
-        progress: where long work reports.
+        progress: receives the progress of long steps.
         options: fields of `mtpcr_geo.pipeline.options.RegisterOptions`. Arrays are local unless `source_crs`
             or `target_crs` names a CRS. A recording is kept where a folder is given, or with recording=True.
 
     Returns:
-        What it came to. A registration that finds nothing is refused, and no error.
+        The result. Where no transform is found the verdict is refused; that is no error.
 
     Raises:
-        MtpcrError: for whatever a user can cause, before anything is written.
+        MtpcrError: if an input, an option or an output cannot be used; nothing is written then.
 
     """
     chosen = read_options({"recording": out is not None, **options})
@@ -274,7 +274,7 @@ def register(
         return Registration(run(nodes, overwrite=chosen.overwrite, progress=progress), force=chosen.force)
     if not chosen.recording:
         return Registration(run(nodes, progress=progress), force=chosen.force)
-    # kept aside until it is saved, and gone with what is returned
+    # kept in a temporary folder until it is saved; deleted together with the registration
     folder = Path(tempfile.mkdtemp(prefix="mtpcr-geo-"))
     nodes += chained([recording_writer(folder)], (nodes[-1].tag,))
     try:
@@ -361,7 +361,7 @@ def read_options(options: dict[str, Any]) -> RegisterOptions:
 
 
 def registration_of(result: RunResult) -> Registration:
-    """Gather what a registering pipeline came to."""
+    """Return the result of a pipeline that registers."""
     return Registration(result)
 
 
@@ -384,7 +384,7 @@ def _check_two(readers: Sequence[Stage]) -> None:
 
 
 def _crs_of_arrays(options: RegisterOptions, source: CloudLike, target: CloudLike) -> dict[str, str]:
-    """Take arrays as local where no CRS is named."""
+    """Return the CRS options of bare arrays for which no CRS is named: local."""
     named = {"source": options.source_crs, "target": options.target_crs}
     return {
         f"{role}_crs": "local"
@@ -401,7 +401,7 @@ def _by_name(paths: Sequence[Path]) -> dict[str, Path]:
 
 
 def _transform_text(pair: Pair) -> str:
-    """Say what the transform does, in one line."""
+    """Describe the transform in one line."""
     from mtpcr_geo.export.descriptions import shift_text
 
     assert pair.T_target_source is not None

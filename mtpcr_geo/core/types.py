@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mtpcr_geo.core.frames import FrameLink, WorkFrame
 
 VerdictName = Literal["accepted", "doubtful", "refused"]
-LevellingMethod = Literal["none", "plane", "verticals"]
+LevellingMethod = Literal["none", "plane", "verticals", "refinement"]
 Look = Literal["band_pass", "paper", "paper_normalised", "grey", "grey_printed"]
 """How the image of a raster is made that keypoint matchers see, see `mtpcr_geo.method.images.image_of`."""
 
@@ -78,7 +78,7 @@ class Levelling(ComparesArrays):
 
     Attributes:
         T_level_work: 4x4 rotation about the sample's centre, work to levelled coordinates.
-        method: "none", "plane" (the paper) or "verticals".
+        method: "none", "plane" (the paper), "verticals", or "refinement" where ICP told the vertical.
         tilt_deg: angle between the cloud's z axis and the vertical found, degrees.
         why: why it was kept as it is, where it was.
         trusted: whether the vertical is known: by the CRS, or since the user says so.
@@ -172,6 +172,7 @@ class Matches(ComparesArrays):
             matchers that search the whole raster.
         margin: strength of the best hypothesis over the next distinct one; None where there is no telling.
         support: share of the patches in the overlap that agree on the pose; None likewise.
+        strength: of the best hypothesis, score times support; None from matchers that have none.
         null_ratio: strength of the best hypothesis over the best of the mirrored source; None likewise.
         report: further figures of the matcher, for the audit only.
         source_keypoints, target_keypoints: (k, 2) pixels of all keypoints, matched or not; None from
@@ -189,6 +190,7 @@ class Matches(ComparesArrays):
     margin: float | None = None
     support: float | None = None
     null_ratio: float | None = None
+    strength: float | None = None
     report: Mapping[str, Any] = field(default_factory=dict)
     source_keypoints: Floats | None = None
     target_keypoints: Floats | None = None

@@ -41,14 +41,19 @@ LEVELS = 3
 COARSEST_YAW_STEP_DEG, FINEST_YAW_STEP_DEG = 4.0, 2.0
 FEWEST_OVERLAP_CELLS = 20
 PEAKS_A_YAW = 3
-HYPOTHESES = 12
-TERRAIN_HYPOTHESES = 6
-DROPPED_BELOW = 0.4
-"""Share of the best score at fine cells below which a hypothesis is not judged by patches."""
+HYPOTHESES = 8
+TERRAIN_HYPOTHESES = 4
+CLEAR_MARGIN = 4.0
+"""Times by which the best strength exceeds a hypothesis' score, which bounds its strength, where patches need
+not be asked: the margin could not fall below this."""
+SMALL_SITE_NEG_LOG10_P, SMALL_SITE_MARGIN, SMALL_SITE_SUPPORT = 8.0, 3.0, 0.5
+"""What convinces where there are too few patches for `CorrelationSettings.convincing_neg_log10_p`."""
 RADIUS_TOLERANCES = 4.0
 """How far the final patch matches may lie from where the pose puts them, tolerances."""
 AGREE_TOLERANCES = 1.5
 MAX_RADIUS_CELLS = 10
+ESTIMATE_CELLS = 20_000.0
+"""Cells that tell which yaw and shift fit best on the way down to the finest level."""
 SAME_YAW_DEG = 5.0
 GROUND_SCALE_M = 0.1
 """Spread of the ground's height differences, beyond the least of all hypotheses, that halves a strength."""
@@ -156,14 +161,16 @@ class Pool:
     Attributes:
         candidates: the hypotheses.
         strengths: of each: score times support, times how well the ground agrees.
+        bound: no hypothesis left unjudged is stronger than this.
 
     """
 
     candidates: tuple[Candidate, ...] = ()
     strengths: tuple[float, ...] = ()
+    bound: float = 0.0
 
     @classmethod
-    def of(cls, candidates: Sequence[Candidate], same_pose_m: float) -> Pool:
+    def of(cls, candidates: Sequence[Candidate], same_pose_m: float, bound: float = 0.0) -> Pool:
         """Rank candidates by strength and the ground, and join those that came down to the same place."""
         known = [c.ground.spread_m for c in candidates if c.ground is not None and c.ground.known]
         least = min(known, default=0.0)
@@ -173,12 +180,12 @@ class Pool:
         for strength, candidate in weighed:
             if not any(_same(candidate.pose, other.pose, same_pose_m) for _, other in kept):
                 kept.append((strength, candidate))
-        return cls(tuple(c for _, c in kept), tuple(s for s, _ in kept))
+        return cls(tuple(c for _, c in kept), tuple(s for s, _ in kept), bound)
 
     @property
     def margin(self) -> float:
-        """Strength of the best over that of the next distinct hypothesis."""
-        return margin_of(self.strengths)
+        """Strength of the best over that of the next distinct hypothesis, at least."""
+        return margin_of(self.strengths, floor=self.bound)
 
 
 def _ground_factor(ground: GroundComparison | None, least_m: float) -> float:
@@ -223,7 +230,7 @@ def match(
     mirrored = None
     if settings.mirrored_null and prior is None:
         twin = _Search(mirror(source), target, scales, settings, seed, advance, search.pyramid)
-        mirrored, _ = twin.explore(None, [level.factor for level in searched])
+        mirrored, _ = twin.explore(None, [level.factor for level in searched], pool.candidates[0].strength)
     best = pool.candidates[0]
     patches = best.patches
     assert patches is not None  # hypotheses in a pool are judged by patches
@@ -232,7 +239,7 @@ def match(
     null_ratio = None
     if mirrored is not None:
         strongest = max((c.strength for c in mirrored.candidates), default=0.0)
-        null_ratio = margin_of([best.strength, strongest], floor=1e-6)
+        null_ratio = margin_of([best.strength, strongest], floor=mirrored.bound)
     report = {
         "cell_m": source.grid.cell,
         "extent_m": scales.extent_m,
@@ -264,6 +271,7 @@ def match(
         margin=pool.margin,
         support=best.support,
         null_ratio=null_ratio,
+        strength=best.strength,
         report=report,
     )
 
@@ -352,27 +360,39 @@ class _Search:
         self.terrain_source = Terrain.of(source, scales.terrain_cell_m)
         self.terrain_target = Terrain.of(target, scales.terrain_cell_m)
 
-    def explore(self, prior: Prior | None, factors: Sequence[int] | None = None) -> tuple[Pool, list[Level]]:
-        """Search level by level until a pose convinces; all of ``factors`` where they are given."""
+    def explore(
+        self, prior: Prior | None, factors: Sequence[int] | None = None, known: float = 0.0
+    ) -> tuple[Pool, list[Level]]:
+        """Search level by level until a pose convinces; all of ``factors`` where they are given.
+
+        Hypotheses that cannot come near the strength ``known`` are not judged by patches.
+        """
         judged: list[Candidate] = []
-        pool, levels = Pool(), []
+        pool, levels, bound = Pool(), [], 0.0
         for factor in factors or search_factors(self.pyramid.source, self.pyramid.target):
             found = self._propose(factor, prior)
             cell = self.pyramid.source.grid.cell * factor
             levels.append(Level(factor, cell, tuple(round(pose.score, 3) for pose in found)))
             if not levels[1:] and prior is None:
                 found = [*found, *self._propose_by_terrain(factor)]
-            judged += self._judge([self._descend(factor, pose) for pose in found])
-            pool = Pool.of(judged, self.scales.same_pose_m)
+            now, left = self._judge([self._descend(factor, pose) for pose in found], known)
+            judged, bound = [*judged, *now], max(bound, left)
+            known = max([known, *(candidate.strength for candidate in judged)])
+            pool = Pool.of(judged, self.scales.same_pose_m, bound)
             if factors is None and self._convinces(pool):
                 break
         return pool, levels
 
     def _convinces(self, pool: Pool) -> bool:
-        return bool(
-            pool.candidates
-            and pool.margin >= self.settings.convincing_margin
-            and pool.candidates[0].neg_log10_p >= self.settings.convincing_neg_log10_p
+        if not pool.candidates or pool.margin < self.settings.convincing_margin:
+            return False
+        best = pool.candidates[0]
+        if best.neg_log10_p >= self.settings.convincing_neg_log10_p:
+            return True
+        return (
+            best.neg_log10_p >= SMALL_SITE_NEG_LOG10_P
+            and pool.margin >= SMALL_SITE_MARGIN
+            and best.support >= SMALL_SITE_SUPPORT
         )
 
     def _yaw_step(self, source: Layer) -> float:
@@ -425,32 +445,51 @@ class _Search:
             source, target = self.pyramid.at(level)
             tries = [
                 score_nearby(
-                    source, target, Pose(pose.yaw + np.radians(k * step), pose.east, pose.north), window
+                    source,
+                    target,
+                    Pose(pose.yaw + np.radians(k * step), pose.east, pose.north),
+                    window,
+                    ESTIMATE_CELLS,
                 )[0]
                 for k in (-2, -1, 0, 1, 2)
             ]
             pose = max(tries, key=lambda p: p.score)
             if level == 1:
-                return Candidate(pose)
+                return Candidate(score_nearby(source, target, pose, 1)[0])
             finer = max(1, level // 2)
             # the centre of the raster moves a little between levels: same pose, other pivot
             hypothesis = pose.hypothesis(centre_of(source.grid))
             pose = pose_of(hypothesis, centre_of(self.pyramid.at(finer)[0].grid))
             level, step, window = finer, step / 2, 3
 
-    def _judge(self, candidates: Sequence[Candidate]) -> list[Candidate]:
-        """Judge by patches and by the ground all that do not score far below the best of their level."""
+    def _judge(self, candidates: Sequence[Candidate], known: float) -> tuple[list[Candidate], float]:
+        """Judge hypotheses by patches and by the ground, those of the highest score at fine cells first.
+
+        A strength is at most the score. What cannot come within `CLEAR_MARGIN` of the best is left with the
+        score as its bound, unjudged.
+
+        Args:
+            candidates: at the finest cells.
+            known: strength reached by any hypothesis so far.
+
+        Returns:
+            What was judged, and the highest score of what was not.
+
+        """
         ranked = sorted(candidates, key=lambda c: -c.pose.score)
-        best = ranked[0].pose.score if ranked else 0.0
-        distinct_ones: list[Candidate] = []
-        for i, candidate in enumerate(ranked):
-            if not np.isfinite(candidate.pose.score):
-                continue
-            if i >= 2 and candidate.pose.score < DROPPED_BELOW * best:
-                break
-            if not any(_same(candidate.pose, c.pose, self.scales.same_pose_m / 4) for c in distinct_ones):
-                distinct_ones.append(candidate)
-        return [self._judge_one(candidate) for candidate in distinct_ones]
+        separate: list[Candidate] = []
+        for candidate in ranked:
+            if np.isfinite(candidate.pose.score) and not any(
+                _same(candidate.pose, other.pose, self.scales.same_pose_m / 4) for other in separate
+            ):
+                separate.append(candidate)
+        judged: list[Candidate] = []
+        for candidate in separate:
+            if candidate.pose.score * CLEAR_MARGIN < known:
+                return judged, candidate.pose.score
+            judged.append(self._judge_one(candidate))
+            known = max(known, judged[-1].strength)
+        return judged, 0.0
 
     def _judge_one(self, candidate: Candidate) -> Candidate:
         """Match patches around a hypothesis, let them correct it, and match again from there."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from mtpcr_geo.core.arrays import Floats, Image
@@ -85,22 +84,21 @@ def match_patches(
     A, E, M = (cut(channel, window) for channel in stack)
     side = 2 * window + 1
     shape = (height // stride - 1, width // stride - 1)
-    score = np.full((side, side, *shape), -1.0, np.float32)
-    fill = np.zeros((side, side, *shape), np.float32)
+    sums = np.empty((7, side * side, shape[0] * shape[1]), np.float32)
     aa, ee, AA, EE = a * a, e * e, A * A, E * E
-    for dy in range(side):
-        for dx in range(side):
-            place = (slice(dy, dy + height), slice(dx, dx + width))
-            Mp = M[place]
-            overlap = _patch_sums(m * Mp, stride)
-            values = correlation_score(
-                overlap,
-                (_patch_sums(a * A[place], stride), _patch_sums(e * E[place], stride)),
-                (_patch_sums(aa * Mp, stride), _patch_sums(ee * Mp, stride)),
-                (_patch_sums(m * AA[place], stride), _patch_sums(m * EE[place], stride)),
-            )
-            score[dy, dx] = values / np.sqrt(np.maximum(overlap, 1.0)) / 2
-            fill[dy, dx] = overlap
+    products = np.empty((7, height, width), np.float32)
+    for shift in range(side * side):
+        dy, dx = divmod(shift, side)
+        place = (slice(dy, dy + height), slice(dx, dx + width))
+        Mp = M[place]
+        pairs = ((m, Mp), (a, A[place]), (e, E[place]), (aa, Mp), (ee, Mp), (m, AA[place]), (m, EE[place]))
+        for product, (one, other) in zip(products, pairs, strict=True):
+            np.multiply(one, other, out=product)
+        sums[:, shift] = _patch_sums(products, stride).reshape(7, -1)
+    overlap = sums[0]
+    values = correlation_score(overlap, (sums[1], sums[2]), (sums[3], sums[4]), (sums[5], sums[6]))
+    score = (values / np.sqrt(np.maximum(overlap, 1.0)) / 2).reshape(side, side, *shape)
+    fill = overlap.reshape(side, side, *shape)
     enough = fill[window, window] >= min_fill * (2 * stride) ** 2
     flat = score.reshape(side * side, *shape)
     best = np.argmax(flat, axis=0)
@@ -124,13 +122,14 @@ def match_patches(
     )
 
 
-def _patch_sums(image: Image, stride: int) -> Image:
-    """Sum over patches of 2 x stride cells, one every stride cells."""
-    height, width = image.shape
-    size = (width // stride, height // stride)
-    # shrinking by a whole factor is the mean over blocks, and much faster than summing over axes
-    blocks = cv2.resize(image, size, interpolation=cv2.INTER_AREA) * np.float32(stride**2)
-    return np.asarray(blocks[:-1, :-1] + blocks[1:, :-1] + blocks[:-1, 1:] + blocks[1:, 1:])
+def _patch_sums(images: Image, stride: int) -> Image:
+    """Sum (k, h, w) images over patches of 2 x stride cells, one every stride cells."""
+    count, height, width = images.shape
+    rows, columns = height // stride, width // stride
+    strips = np.add.reduce(images.reshape(count, rows, stride, width), axis=2)
+    blocks = np.add.reduce(strips.reshape(count, rows, columns, stride), axis=3)
+    across = blocks[:, :, :-1] + blocks[:, :, 1:]
+    return np.asarray(across[:, :-1] + across[:, 1:])
 
 
 def _parabola(before: Image, at: Image, after: Image) -> Floats:

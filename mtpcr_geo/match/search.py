@@ -201,10 +201,19 @@ def distinct(poses: Iterable[Pose], count: int, yaw_apart: float, metres_apart: 
     return kept
 
 
-def score_nearby(source: Layer, target: Layer, pose: Pose, window: int) -> tuple[Pose, Image]:
+def score_nearby(
+    source: Layer, target: Layer, pose: Pose, window: int, max_cells: float = np.inf
+) -> tuple[Pose, Image]:
     """Score a pose and all shifts within ``window`` cells of it; give the best and the score window.
 
-    Only the part of the target under the source is looked at, so it costs little at fine cells.
+    Only the part of the target under the source is compared, so it costs little at fine cells.
+
+    Args:
+        source, target: layers of one cell size.
+        pose: the pose.
+        window: shifts up to so many cells are tried.
+        max_cells: of larger parts only every n-th row is compared, for an estimate.
+
     """
     part, offset = _target_under(source.grid, target.grid, pose, window)
     side = 2 * window + 1
@@ -214,8 +223,9 @@ def score_nearby(source: Layer, target: Layer, pose: Pose, window: int) -> tuple
     warped = warp_to(source.channels.stack, source.grid, part, pose)
     inner = (slice(window, part.height - window), slice(window, part.width - window))
     mask = (warped[2] > FILLED).astype(np.float32)[inner]
-    a, e = (warped[0][inner] * mask).ravel(), (warped[1][inner] * mask).ravel()
-    m = mask.ravel()
+    step = max(1, int(mask.size / max_cells))
+    a, e = (warped[0][inner] * mask)[::step].ravel(), (warped[1][inner] * mask)[::step].ravel()
+    m = mask[::step].ravel()
     row0, column0 = offset
     rows, columns = inner[0].stop - window, inner[1].stop - window
     stack = target.channels.stack[:, row0 : row0 + part.height, column0 : column0 + part.width]
@@ -223,9 +233,10 @@ def score_nearby(source: Layer, target: Layer, pose: Pose, window: int) -> tuple
     aa, ee = a * a, e * e
     for dy in range(side):
         for dx in range(side):
-            A, E, M = (c.ravel() for c in stack[:, dy : dy + rows, dx : dx + columns])
+            A, E, M = (c.ravel() for c in stack[:, dy : dy + rows : step, dx : dx + columns])
             mA, mE = m * A, m * E
             sums[:, dy, dx] = (m @ M, a @ A, e @ E, aa @ M, ee @ M, mA @ A, mE @ E)
+    sums *= step
     overlap = sums[0]
     score = correlation_score(overlap, (sums[1], sums[2]), (sums[3], sums[4]), (sums[5], sums[6]))
     best_dy, best_dx = divmod(int(np.argmax(score)), side)

@@ -31,12 +31,12 @@ FLAT = 4.0
 
 PROBES = 10_000
 MEETS_M = 0.1
-"""Gap between surfaces at which half the cost is reached that surfaces bear which do not meet at all."""
+"""Gap between surfaces, metres, at which the bounded cost reaches half of its greatest value."""
 
 
 @dataclass(frozen=True)
 class Rounds:
-    """How a run of ICP goes about it.
+    """Settings of one run of ICP.
 
     Attributes:
         max_correspondence_distances_m: farthest correspondence of each round, metres.
@@ -69,10 +69,10 @@ class Surfaces:
 
     Args:
         source, target: (n, 3) and (m, 3) work coordinates, metres.
-        T_start: 4x4 from source to target, near the result: it tells which points lie in the overlap.
+        T_start: 4x4 from source to target, near the result: it decides which points lie in the overlap.
         voxel_m: thinning, metres.
         max_correspondence_distance_m: farthest correspondence to be asked for, metres.
-        most_points: of the source after thinning; the target, which costs less, may have three times as many.
+        max_points: of the source after thinning; the target, which costs less, may have three times as many.
         threads: for thinning and surfaces.
 
     Raises:

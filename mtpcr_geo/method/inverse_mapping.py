@@ -25,10 +25,11 @@ def inverse_mapping(px: Floats, bev: Bev, *, surface: Surface = "ground", pixel:
         px: (n, 2) pixel coordinates (column, row), pixel centres at integers.
         bev: the raster, in levelled coordinates.
         surface: "ground" takes the lowest z around the pixel, which both clouds see under canopy and
-            eaves; "top" takes the highest z of the cell; "grey" has it in 255 steps, as in the paper.
+            eaves; "top" takes the highest z of the cell; "grey" rounds that down to 255 steps of the
+            raster's height range, as in the paper.
         pixel: "centre" puts a pixel at the centre of its cell; "ceil" at the north-east corner, which is
             Eq. 5 without the misprint (Y from j); "printed" takes Y from i, as printed, so that all points
-            fall on one line. Both suit rasters of the ceiling convention (Eq. 2 as printed).
+            fall on one line. The last two suit rasters of the ceiling convention (Eq. 2 as printed).
 
     Returns:
         (n, 3) metres in the raster's frame; z is NaN where the raster is empty or the pixel lies outside.
@@ -65,19 +66,23 @@ def tie_points_of(
     block_m: float | None = None,
     seed: int = 0,
 ) -> TiePoints:
-    """Map matches back to 3D (Eq. 5), and set some aside to judge the result by.
+    """Map matches back to 3D (Eq. 5), and hold some out to judge the result by.
 
-    The tie points of whole square blocks of the target go into one fold, so that tie points held out are
-    no neighbours of those the transform is solved from. Those without a height on either side are left out.
+    The target is divided into square blocks, and all tie points of a block go into the same fold, so that
+    those held out are not neighbours of those the transform is solved from. Matches without a height in
+    either raster are left out.
 
     Args:
         matches: pixel pairs.
         source: raster of the cloud that moves.
         target: raster of the cloud that stays.
         surface, pixel: see `inverse_mapping`.
-        folds: parts into which the blocks are dealt; the first is held out from the solve.
+        folds: number of folds; the first is held out from the solve.
         block_m: edge of a block, metres; from the tie points' extent if None.
-        seed: chooses the blocks.
+        seed: of the assignment of blocks to folds.
+
+    Returns:
+        The tie points, metres in the levelled frames of both rasters.
 
     """
     s = inverse_mapping(matches.source_px, source, surface=surface, pixel=pixel)
@@ -100,15 +105,16 @@ def _lowest_around(bev: Bev) -> NDArray[np.float32]:
 
 
 def folds_of(xy: Floats, folds: int, block_m: float, seed: int) -> NDArray[np.int64]:
-    """Deal points into folds, whole square blocks at a time and evenly.
+    """Assign points to folds by whole square blocks, with equal numbers of blocks.
 
-    The blocks start at the points' own corner, so a shift of the scene changes nothing.
+    The blocks start at the least x and y of the points, to the metre, so that a shift of all points by whole
+    metres changes nothing.
 
     Args:
         xy: (n, 2) metres.
         folds: number of folds.
         block_m: edge of a block, metres.
-        seed: chooses which block goes into which fold.
+        seed: of the assignment.
 
     Returns:
         (n,) numbers 0..folds-1.

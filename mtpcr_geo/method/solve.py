@@ -1,7 +1,8 @@
 """From tie points to a rigid transform: iterative SVD with outlier rejection, and a robust start for it.
 
-One SVD over many outliers does not recover, however often it is repeated; with gravity known only a yaw and
-a shift remain, two tie points determine them, and RANSAC over pairs of tie points gives a start that does.
+From many outliers the SVD does not recover, however often it is repeated. With the vertical known, only a yaw
+and a shift remain; two tie points determine them, so that RANSAC over pairs of tie points finds a start which
+the SVD can improve.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ DEFAULTS = SolveSettings()
 
 
 def fit_rigid(source: Floats, target: Floats, weight: Floats | None = None) -> Floats:
-    """Least-squares rigid transform without scale (Kabsch; Umeyama 1991, doi:10.1109/34.88573).
+    """Return the least-squares rigid transform without scale (Kabsch; Umeyama 1991, doi:10.1109/34.88573).
 
     Args:
         source, target: (n, 3) corresponding points, metres, n >= 3 and not on a line.
@@ -39,7 +40,7 @@ def fit_rigid(source: Floats, target: Floats, weight: Floats | None = None) -> F
 
 
 def fit_upright(source: Floats, target: Floats, weight: Floats | None = None) -> Floats:
-    """Least-squares yaw and shift, with the vertical known.
+    """Return the least-squares yaw and shift, with the vertical known.
 
     Args:
         source, target: (n, 3) or (n, 2) corresponding points, metres, n >= 2.
@@ -150,11 +151,13 @@ def iterative_svd(
         factor: residuals beyond this many times 1.4826 median residuals are outliers.
         floor: the threshold never falls below this, metres: below the raster's own precision a residual
             says nothing.
-        ceiling: nor does it rise above this, metres: from few tie points that agree badly it would grow
-            until it
-            takes in all.
+        ceiling: nor does it rise above this, metres: with few tie points that agree badly it would grow until
+            it includes all.
         max_iterations: rounds at most.
         upright: solve yaw and shift only.
+
+    Returns:
+        The transform, its (n,) inlier mask, the rounds, and the last threshold in metres.
 
     """
     fit = fit_upright if upright else fit_rigid
@@ -211,12 +214,12 @@ def solve_tie_points(
             raise RegistrationError(
                 f"of {len(used)} tie points no {least} agree on one yaw and shift; the clouds may not overlap"
             )
-    # the start says to what distance tie points agree; as in the paper there is no such bound
+    # a robust start bounds how far agreeing tie points may lie apart; the paper has no such bound
     ceiling = 2.0 * tolerance if settings.robust_start else np.inf
     weight = np.maximum(tie_points.score[used], 0.05) ** 2
     flat = np.array([1.0, 1.0, 0.0])
     if settings.upright:
-        # heights of single tie points are rough, so they have no say in plan and are settled by their median
+        # heights of single tie points are rough: plan is solved without them, height from their median
         solution = iterative_svd(
             s * flat, t * flat, start=start, weight=weight, floor=tolerance, ceiling=ceiling, upright=True
         )

@@ -53,8 +53,8 @@ class Pipeline:
 
     Example:
         >>> from mtpcr_geo import Pipeline
-        >>> clouds = Pipeline(["target.laz", "source.laz"])
-        >>> pipeline = clouds | {"type": "mtpcr.register"} | {"type": "mtpcr.apply"} | "registered.laz"
+        >>> register = Pipeline(["target.laz", "source.laz", {"type": "mtpcr.register"}])
+        >>> pipeline = register | {"type": "mtpcr.apply"} | "registered.laz"
         >>> pipeline.execute()  # doctest: +SKIP
         99618
         >>> pipeline.verdict.name  # doctest: +SKIP

@@ -171,7 +171,7 @@ class Match(Stage):
                 f"{source.grid.cell:g} and {target.grid.cell:g} m; set resolution to common in mtpcr.bev"
             )
         if matcher.needs_image:
-            pair = pair.with_(source=_shown(pair.source), target=_shown(pair.target))
+            pair = pair.with_(source=shown(pair.source), target=shown(pair.target))
         yaw = None
         if prior is not None and self.options.prior_yaw <= TOLERATED_ROTATION_DEG:
             yaw = prior.hypothesis.yaw
@@ -280,7 +280,7 @@ class Focus(Stage):
         return pair.with_(matches=matches)
 
 
-def _shown(side: Side) -> Side:
+def shown(side: Side) -> Side:
     """Return the side with an image of its raster, so that what was matched is on record."""
     from mtpcr_geo.method.images import grey, image_of
 
@@ -298,7 +298,7 @@ def view_of(side: Side, with_image: bool) -> View:
     from mtpcr_geo.method.images import empty_grey
 
     assert side.bev is not None
-    shown = _shown(side).appearance if with_image else None
+    shown = shown(side).appearance if with_image else None
     return View(side.bev) if shown is None else View(side.bev, shown.image, empty_grey(shown.look))
 
 

@@ -175,7 +175,7 @@ class MakeBev(Stage):
             self.metadata["gamma_m"] = cells.gamma_m
         done = []
         for side, coverage, cell in zip(sides, coverages, cells.cells_m, strict=True):
-            bev = _rasterised(side, cell, options.pixel, context)
+            bev = rasterised(side, cell, options.pixel, context)
             done.append(replace(side, bev=bev))
             self.metadata[side.role] = {
                 "cell_m": cell,
@@ -192,7 +192,7 @@ def _coverage(side: Side) -> Coverage:
     return coverage_of(side.sample, side.levelled_sample, side.cloud.count)
 
 
-def _rasterised(side: Side, cell: float, convention: Convention, context: RunContext) -> Bev:
+def rasterised(side: Side, cell: float, convention: Convention, context: RunContext) -> Bev:
     """Rasterise a side from its sample where that is the whole cloud, else from a pass over its points."""
     if side.complete:
         return make_bev(side.levelled_sample, cell, convention)

@@ -173,6 +173,11 @@ class RefineOptions(StageOptions):
     iterations: int = Field(30, ge=1, description="iterations of each round at most")
     motion: Motion = "rigid"
     ground: bool = Field(True, description="settle height and tilt on the ground before, and height after")
+    feedback: bool = Field(
+        True,
+        description="where a vertical is not known and ICP tilts the source: level it by that, match and solve "
+        "again once",
+    )
     keep_tie_points: float = Field(
         0.5,
         ge=0,
@@ -193,6 +198,8 @@ class Refine(Stage):
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Refine the solved transform."""
         from mtpcr_geo.method.refine import RefineSettings, refine
+        from mtpcr_geo.pipeline.stages.feedback import fed_back
+        from mtpcr_geo.pipeline.stages.rasters import rasterised
         from mtpcr_geo.verdict.evidence import tie_points_agreeing
 
         pair = self.one_pair(inputs)
@@ -222,6 +229,13 @@ class Refine(Stage):
             R_upright=pair.target.T_level_work[:3, :3].T @ pair.source.T_level_work[:3, :3],
         )
         self.metadata |= refinement.audit()
+        trusted = pair.source.levelling.trusted and pair.target.levelling.trusted
+        if not trusted and options.feedback:
+            again = fed_back(pair, settings, lambda side, cell: rasterised(side, cell, "centre", context))
+            if again is not None and again.refinement is not None:
+                tilt = again.source.levelling.tilt_deg
+                self.metadata |= {"levelled_again": True, "tilt_deg": tilt, **again.refinement.audit()}
+                return again
         return pair.with_(T_target_source=refinement.T, refinement=refinement)
 
 

@@ -1,0 +1,133 @@
+"""The refinement's vertical fed back once: level the source by it, rasterise, match and solve again.
+
+Tie points matched under a wrong vertical agree with a wrong transform. Where neither cloud's CRS tells the
+vertical and ICP, following the surfaces alone, tilts the source, the tie points cannot judge that; those found
+under the new vertical can.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.errors import RegistrationError
+from mtpcr_geo.core.types import Bev, Levelling, Pair, Side
+from mtpcr_geo.method.inverse_mapping import tie_points_of
+from mtpcr_geo.method.refine import RefineSettings, refine
+from mtpcr_geo.method.scales import tolerance_for
+from mtpcr_geo.method.solve import solve_tie_points
+from mtpcr_geo.pipeline.stages.matching import shown, view_of
+from mtpcr_geo.verdict.evidence import tie_points_agreeing
+
+LEAST_TILT_DEG = 0.3
+"""Tilt left between the levelled clouds from which on a new vertical is worth a second search."""
+MOST_TILT_DEG = 30.0
+
+
+def levelled_by(pair: Pair, T_target_source: Floats) -> Levelling:
+    """Return the levelling of the source under which a transform is a yaw and a shift alone.
+
+    Args:
+        pair: levelled; the target's vertical is kept.
+        T_target_source: 4x4 between work coordinates.
+
+    """
+    R = (pair.target.T_level_work @ T_target_source)[:3, :3]
+    tilt = transforms.yaw_matrix(transforms.yaw_of(R)).T @ R
+    centre = pair.source.sample.mean(axis=0)
+    return replace(
+        pair.source.levelling,
+        T_level_work=transforms.about(centre, transforms.orthonormal(tilt)),
+        method="refinement",
+        tilt_deg=float(np.degrees(transforms.rotation_angle(tilt))),
+        why=None,
+    )
+
+
+def tilt_between_deg(pair: Pair, T_target_source: Floats) -> float:
+    """Return the tilt that a transform leaves between the levelled clouds, degrees."""
+    R = pair.levelled(T_target_source)[:3, :3]
+    return float(np.degrees(transforms.rotation_angle(transforms.yaw_matrix(transforms.yaw_of(R)).T @ R)))
+
+
+def fed_back(pair: Pair, settings: RefineSettings, rasterise: Callable[[Side, float], Bev]) -> Pair | None:
+    """Level the source by what ICP finds without regard to the tie points, and register again from there.
+
+    Args:
+        pair: solved, with matches and rasters; not both verticals are known.
+        settings: of the refinement.
+        rasterise: makes the raster of a side at a cell, metres.
+
+    Returns:
+        The pair matched, solved and refined anew, or None where the vertical was right, or the second search
+        does not bear out the new one.
+
+    """
+    matches, source, target = pair.matches, pair.source.bev, pair.target.bev
+    if pair.T_target_source is None or matches is None or source is None or target is None:
+        return None
+    if settings.method is None or settings.motion != "rigid" or settings.keep_tie_points == 0:
+        return None
+    free = refine(
+        pair.source.sample,
+        pair.target.sample,
+        pair.T_target_source,
+        replace(settings, keep_tie_points=0.0),
+        cell=pair.cell,
+    )
+    tilt = tilt_between_deg(pair, free.T)
+    if not LEAST_TILT_DEG <= tilt <= MOST_TILT_DEG:
+        return None
+    side = replace(pair.source, levelling=levelled_by(pair, free.T), bev=None, appearance=None)
+    again = pair.with_(source=replace(side, bev=rasterise(side, source.grid.cell)), refinement=None)
+    try:
+        again = _solved(again, pair)
+    except RegistrationError:
+        return None
+    found, before = again.matches, matches
+    if found is None or (found.strength or 0.0) < (before.strength or 0.0):
+        return None
+    assert again.T_target_source is not None
+    refinement = refine(
+        again.source.sample,
+        again.target.sample,
+        again.T_target_source,
+        settings,
+        cell=again.cell,
+        agreeing=lambda T: tie_points_agreeing(again, T),
+    )
+    return again.with_(T_target_source=refinement.T, refinement=refinement)
+
+
+def _solved(again: Pair, before: Pair) -> Pair:
+    """Match and solve with the matcher and the settings of the first time.
+
+    Raises:
+        RegistrationError: if there is nothing to match, or too few tie points agree.
+
+    """
+    first, solution = before.matches, before.solution
+    assert first is not None
+    assert solution is not None
+    matcher = first.matcher
+    if matcher.needs_image:
+        again = again.with_(source=shown(again.source), target=shown(again.target))
+    views = [view_of(side, matcher.needs_image) for side in (again.source, again.target)]
+    matches = replace(matcher.match(*views, seed=solution.settings.seed), matcher=matcher)
+    assert again.source.bev is not None
+    assert again.target.bev is not None
+    tie_points = tie_points_of(
+        matches, again.source.bev, again.target.bev, seed=solution.settings.seed
+    )
+    solved, inlier = solve_tie_points(tie_points, 1.5 * tolerance_for(again.cell), solution.settings)
+    T = transforms.inverse(again.target.T_level_work) @ solved.T @ again.source.T_level_work
+    return again.with_(
+        matches=matches,
+        tie_points=replace(tie_points, inlier=inlier),
+        T_target_source=T,
+        solution=solved,
+    )
