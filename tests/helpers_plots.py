@@ -59,7 +59,9 @@ def with_trees(
     return np.asarray(xyz + rng.normal(0.0, rough, xyz.shape))
 
 
-def plot(rng: np.random.Generator, extent: float = 25.0, density: float = 100.0) -> np.ndarray:
+def plot(
+    rng: np.random.Generator, extent: float = 25.0, density: float = 100.0, rough: float = 0.02
+) -> np.ndarray:
     """(n, 3) points of a forest plot around zero, metres; the trees are always the same."""
     site = np.random.default_rng(SITE)
     k = round(extent**2 / 16.0)
@@ -67,7 +69,7 @@ def plot(rng: np.random.Generator, extent: float = 25.0, density: float = 100.0)
         [site.uniform(-extent / 2, extent / 2, (k, 2)), site.uniform(0.7, 2.2, k), site.uniform(4.0, 14.0, k)]
     )
     half = np.full(2, extent / 2)
-    return with_trees(rng, -half, half, density, trees)
+    return with_trees(rng, -half, half, density, trees, rough=rough)
 
 
 def planting(
@@ -78,6 +80,6 @@ def planting(
     x, y = (one.ravel() for one in np.meshgrid(np.arange(-200.0, 201.0, 5.0), np.arange(-200.0, 201.0, 5.0)))
     there = site.uniform(size=len(x)) > 1 / 12
     trees = np.column_stack([x, y, np.full(len(x), 1.8), np.full(len(x), 4.0)])[there]
-    low, high = np.array(low), np.array(high)
-    near = ((trees[:, :2] > low - 2.0) & (trees[:, :2] < high + 2.0)).all(axis=1)
-    return with_trees(rng, low, high, density, trees[near])
+    corners = np.array(low), np.array(high)
+    near = ((trees[:, :2] > corners[0] - 2.0) & (trees[:, :2] < corners[1] + 2.0)).all(axis=1)
+    return with_trees(rng, *corners, density, trees[near])

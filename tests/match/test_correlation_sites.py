@@ -95,7 +95,7 @@ def towns() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def found(towns: tuple[np.ndarray, np.ndarray]) -> Matches:
-    return match(*(bev_of(xyz, 1.0) for xyz in towns))
+    return match(bev_of(towns[0], 1.0), bev_of(towns[1], 1.0))
 
 
 def test_reflecting_twice_gives_the_raster_back(towns: tuple[np.ndarray, np.ndarray]) -> None:
@@ -129,7 +129,7 @@ def test_the_mirrored_search_changes_no_match(towns: tuple[np.ndarray, np.ndarra
 
 
 def test_exchanged_clouds_give_the_inverse(towns: tuple[np.ndarray, np.ndarray], found: Matches) -> None:
-    exchanged = match(*(bev_of(xyz, 1.0) for xyz in towns[::-1]))
+    exchanged = match(bev_of(towns[1], 1.0), bev_of(towns[0], 1.0))
     there, back = (transform_of(one.hypotheses[0]) for one in (found, exchanged))
     centre = towns[1].mean(axis=0)
     yaw, plan = off(there, back, centre)

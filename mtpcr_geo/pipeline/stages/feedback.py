@@ -120,9 +120,7 @@ def _solved(again: Pair, before: Pair) -> Pair:
     matches = replace(matcher.match(*views, seed=solution.settings.seed), matcher=matcher)
     assert again.source.bev is not None
     assert again.target.bev is not None
-    tie_points = tie_points_of(
-        matches, again.source.bev, again.target.bev, seed=solution.settings.seed
-    )
+    tie_points = tie_points_of(matches, again.source.bev, again.target.bev, seed=solution.settings.seed)
     solved, inlier = solve_tie_points(tie_points, 1.5 * tolerance_for(again.cell), solution.settings)
     T = transforms.inverse(again.target.T_level_work) @ solved.T @ again.source.T_level_work
     return again.with_(

@@ -298,8 +298,8 @@ def view_of(side: Side, with_image: bool) -> View:
     from mtpcr_geo.method.images import empty_grey
 
     assert side.bev is not None
-    shown = shown(side).appearance if with_image else None
-    return View(side.bev) if shown is None else View(side.bev, shown.image, empty_grey(shown.look))
+    seen = shown(side).appearance if with_image else None
+    return View(side.bev) if seen is None else View(side.bev, seen.image, empty_grey(seen.look))
 
 
 def _view(bev: Bev, look: Look | None) -> View:
