@@ -170,7 +170,7 @@ class Pool:
     bound: float = 0.0
 
     @classmethod
-    def of(cls, candidates: Sequence[Candidate], same_pose_m: float, bound: float = 0.0) -> Pool:
+    def of(cls, candidates: Sequence[Candidate], scales: Scales, bound: float = 0.0) -> Pool:
         """Rank candidates by strength and the ground, and join those that came down to the same place."""
         known = [c.ground.spread_m for c in candidates if c.ground is not None and c.ground.known]
         least = min(known, default=0.0)
@@ -178,7 +178,10 @@ class Pool:
         weighed.sort(key=lambda one: (-one[0], -one[1].pose.score))
         kept: list[tuple[float, Candidate]] = []
         for strength, candidate in weighed:
-            if not any(_same(candidate.pose, other.pose, same_pose_m) for _, other in kept):
+            if not any(
+                _same(candidate.pose, other.pose, scales.same_pose_m, scales.extent_m / 2)
+                for _, other in kept
+            ):
                 kept.append((strength, candidate))
         return cls(tuple(c for _, c in kept), tuple(s for s, _ in kept), bound)
 
@@ -378,7 +381,7 @@ class _Search:
             now, left = self._judge([self._descend(factor, pose) for pose in found], known)
             judged, bound = [*judged, *now], max(bound, left)
             known = max([known, *(candidate.strength for candidate in judged)])
-            pool = Pool.of(judged, self.scales.same_pose_m, bound)
+            pool = Pool.of(judged, self.scales, bound)
             if factors is None and self._convinces(pool):
                 break
         return pool, levels
@@ -480,7 +483,7 @@ class _Search:
         separate: list[Candidate] = []
         for candidate in ranked:
             if np.isfinite(candidate.pose.score) and not any(
-                _same(candidate.pose, other.pose, self.scales.same_pose_m / 4) for other in separate
+                _same(candidate.pose, other.pose, self.scales.same_pose_m / 4, np.inf) for other in separate
             ):
                 separate.append(candidate)
         judged: list[Candidate] = []
@@ -522,9 +525,11 @@ class _Search:
         return Candidate(pose, patches, supporting, ground)
 
 
-def _same(a: Pose, b: Pose, apart_m: float) -> bool:
-    apart = float(np.hypot(a.east - b.east, a.north - b.north))
-    return angle_between(a.yaw, b.yaw) < np.radians(SAME_YAW_DEG) and apart < apart_m
+def _same(a: Pose, b: Pose, apart_m: float, radius_m: float) -> bool:
+    """Return whether two poses are one: near in place, and in yaw or in what it moves at the rim."""
+    angle = angle_between(a.yaw, b.yaw)
+    near = float(np.hypot(a.east - b.east, a.north - b.north)) < apart_m
+    return near and (angle < np.radians(SAME_YAW_DEG) or angle * radius_m < apart_m)
 
 
 def _radius_cells(scales: Scales) -> int:

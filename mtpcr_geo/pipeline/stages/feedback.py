@@ -1,8 +1,8 @@
 """The refinement's vertical fed back once: level the source by it, rasterise, match and solve again.
 
-Tie points matched under a wrong vertical agree with a wrong transform. Where neither cloud's CRS tells the
-vertical and ICP, following the surfaces alone, tilts the source, the tie points cannot judge that; those found
-under the new vertical can.
+Tie points matched under a wrong vertical agree with a wrong transform. Where a vertical is not known and ICP,
+following the surfaces alone, tilts the source, those tie points cannot judge that; the ones found under the
+new vertical can.
 """
 
 from __future__ import annotations

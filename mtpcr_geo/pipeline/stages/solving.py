@@ -175,8 +175,8 @@ class RefineOptions(StageOptions):
     ground: bool = Field(True, description="settle height and tilt on the ground before, and height after")
     feedback: bool = Field(
         True,
-        description="where a vertical is not known and ICP tilts the source: level it by that, match and solve "
-        "again once",
+        description="where a vertical is not known and ICP tilts the source: level it by that, match and "
+        "solve again once",
     )
     keep_tie_points: float = Field(
         0.5,
