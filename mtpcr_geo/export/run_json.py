@@ -54,6 +54,8 @@ The metrics:
 - ``metrics.hypothesis_margin``: how many times stronger the pose is than the next distinct one; null if
   unknown
 - ``metrics.patch_support``: share of the patches in the overlap that agree on the pose; null from keypoints
+- ``metrics.null_ratio``: how many times stronger the pose is than the best of the mirrored source, which has
+  no right pose; null from keypoints and with a prior
 - ``metrics.overlap_m2``: ground that both clouds see
 - ``metrics.overlap_source``: the same as a share of the source's ground, 0 to 1
 - ``metrics.overlap_target``: the same as a share of the target's ground, 0 to 1
@@ -87,6 +89,7 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.level <role>.method``: none, plane or verticals: what the cloud was levelled by
 - ``mtpcr.level <role>.tilt_deg``: angle between its z axis and the vertical found
 - ``mtpcr.level <role>.why``: why it was kept as it is, where it was
+- ``mtpcr.level <role>.trusted``: whether its vertical is known: by the CRS, or since the options say so
 - ``mtpcr.level <role>.plane_tilt_deg``: tilt of the ground plane
 - ``mtpcr.level <role>.plane_inlier_share``: share of the points on that plane, 0 to 1
 - ``mtpcr.level <role>.verticals``: points on walls, poles and trunks that agree on the vertical
@@ -106,6 +109,8 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.match matches``: matches found
 - ``mtpcr.match method``: name of a keypoint matcher
 - ``mtpcr.match cell_m``: cell of the last search; from keypoints, those of both rasters
+- ``mtpcr.match extent_m``: edge of a square of the smaller cloud's occupied area, from which lengths follow
+- ``mtpcr.match patch_m``: edge of a patch of the local matches
 - ``mtpcr.match search_radius_m``: how far around the pose each patch was searched
 - ``mtpcr.match searched[].cell_m``: cell of each level of the search
 - ``mtpcr.match searched[].scores``: scores of its hypotheses, best first
@@ -115,7 +120,12 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.match neg_log10_p``: significance of that support
 - ``mtpcr.match patches``: patches in the overlap
 - ``mtpcr.match scores``: scores of the hypotheses at the finest cells
-- ``mtpcr.match strengths``: their strengths: score less what chance gives
+- ``mtpcr.match strengths``: their strengths: score times support, times how well the ground agrees
+- ``mtpcr.match ground_spread_m``: robust spread of the differences between both grounds' heights under each
+  of them; null where too little ground is compared
+- ``mtpcr.match mirrored_strengths``: score times support of the hypotheses of the mirrored source; null where
+  it was not searched
+- ``mtpcr.match null_ratio``: score times support of the best hypothesis over the best of these
 - ``mtpcr.match zoom``: factor by which images were reduced before keypoints were sought
 - ``mtpcr.match turns_deg``: turns of the source that were tried
 - ``mtpcr.match turn_matches``: matches at each of them
@@ -163,6 +173,11 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.refine icp.rounds[].iterations``: its iterations
 - ``mtpcr.refine icp.rounds[].inliers``: points with a correspondence at its end
 - ``mtpcr.refine icp.rounds[].converged``: whether it stood still
+- ``mtpcr.refine icp.fine.voxel_m``: thinning of the points in a last, finer round, where there was one
+- ``mtpcr.refine icp.fine.max_correspondence_distance_m``: farthest correspondence of that round
+- ``mtpcr.refine icp.fine.iterations``: its iterations
+- ``mtpcr.refine icp.fine.inliers``: points with a correspondence at its end
+- ``mtpcr.refine icp.fine.converged``: whether it stood still
 - ``mtpcr.refine icp.rotated_deg``: angle by which ICP turned the start
 - ``mtpcr.assess verdict``: as above
 - ``mtpcr.assess reasons``: as above

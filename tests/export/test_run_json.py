@@ -9,9 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import laspy
+import numpy as np
 import pytest
+from helpers_plots import plot
 
+from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.export import run_json
+from mtpcr_geo.io.write import write_cloud
 from mtpcr_geo.registration import register
 
 KEYS = re.findall(r"^- ``(.+?)``: ", run_json.__doc__ or "", flags=re.M)
@@ -71,10 +75,24 @@ def found_keys(
         source = laspy.read(town_files[0]) if name == "prior" else town_files[0]
         register(source, town_files[1], out, recording=False, **options)
         found[name] = keys_of(json.loads((out / "run.json").read_text()))
+    # dense enough for a last, finer round of the refinement
+    rng = np.random.default_rng(3)
+    out = tmp_path_factory.mktemp("plot") / "out"
+    cloud = ArrayCloud(plot(rng, density=200.0), None, "plot")
+    write_cloud(out.parent / "plot.laz", cloud, None, None)
+    register(
+        out.parent / "plot.laz",
+        plot(rng, density=200.0) + [3.0, -2.0, 1.0],
+        out,
+        recording=False,
+        source_crs="local",
+        target_crs="local",
+    )
+    found["plot"] = keys_of(json.loads((out / "run.json").read_text()))
     return found
 
 
-@pytest.mark.parametrize("name", ["correlation", "prior", "keypoints", "failed"])
+@pytest.mark.parametrize("name", ["correlation", "prior", "keypoints", "failed", "plot"])
 def test_every_key_of_a_run_is_listed(found_keys: dict[str, set[str]], name: str) -> None:
     assert [key for key in found_keys[name] if not any(matches(one, key) for one in KEYS)] == []
 

@@ -118,6 +118,14 @@ def test_search_levels_suit_the_size() -> None:
 
 
 def test_rasters_too_small_to_compare_are_refused() -> None:
-    tiny = bev_of(np.random.default_rng(2).uniform(0, 6, (500, 3)))
+    tiny = bev_of(np.random.default_rng(2).uniform(0, 4, (500, 3)))
     with pytest.raises(RegistrationError, match="overlap enough"):
         match(tiny, tiny, CorrelationSettings())
+
+
+def test_rasters_too_small_for_a_patch_are_worth_nothing() -> None:
+    small = bev_of(np.random.default_rng(2).uniform(0, 6, (500, 3)))
+    found = match(small, small, CorrelationSettings())
+    assert found.support == 0.0
+    assert found.margin == 1.0
+    assert found.null_ratio == 1.0

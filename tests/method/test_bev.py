@@ -66,8 +66,8 @@ def test_the_sparser_cloud_sets_the_cell() -> None:
     rng = np.random.default_rng(4)
     dense = coverage_of(rng.uniform(0, 100, (100_000, 3))).per_m2
     sparse = coverage_of(rng.uniform(0, 200, (13_000, 3))).per_m2
-    assert choose_cell(dense, dense) == 1.0
-    assert choose_cell(dense, sparse) > choose_cell(dense, dense)
+    assert choose_cell([dense, dense]) == 1.0
+    assert choose_cell([dense, sparse]) > choose_cell([dense, dense])
 
 
 def test_a_raster_too_large_is_refused_with_the_way_out() -> None:

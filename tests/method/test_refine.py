@@ -2,15 +2,24 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers_plots import plot
 from helpers_scene import houses, make_pair
 
 from mtpcr_geo.benchmark.steps import follow, level_pair
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.types import IcpMethod, Refinement, TiePoints
+from mtpcr_geo.method import refine as refine_module
 from mtpcr_geo.method.icp import FAR_DISTANCES_M, NEAR_DISTANCES_M, Rounds, Surfaces, rounds_for
 from mtpcr_geo.method.overlap import overlap_of
-from mtpcr_geo.method.refine import follow_icp, settle_on_ground
+from mtpcr_geo.method.refine import (
+    FINEST_VOXEL_M,
+    RefineSettings,
+    fine_voxel,
+    follow_icp,
+    refine,
+    settle_on_ground,
+)
 from mtpcr_geo.verdict.evidence import gather, tie_points_agreeing
 
 
@@ -187,3 +196,54 @@ def test_way_from_the_ties_is_measured_in_plan() -> None:
         refinement=Refinement(pair.T_target_source, transforms.translation(-aside) @ pair.T_target_source)
     )
     assert gather(moved)[0].refined_away_m == pytest.approx(2.5)
+
+
+def test_dense_plots_get_a_last_finer_round(monkeypatch: pytest.MonkeyPatch) -> None:
+    off_by_then = []
+    corners = np.array([[12.0, 12, 0], [-12, 12, 0], [-12, -12, 0], [12, -12, 0]])
+
+    def off(T: np.ndarray) -> float:
+        return float(np.linalg.norm(transforms.apply(T, corners) - corners, axis=1).max())
+
+    finely = refine_module._refined_finely
+
+    def noted(source, target, T_start, settings, agreeing):
+        off_by_then.append(off(T_start))
+        return finely(source, target, T_start, settings, agreeing)
+
+    monkeypatch.setattr(refine_module, "_refined_finely", noted)
+    found = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        source, target = plot(rng, density=400.0, rough=0.05), plot(rng, density=400.0, rough=0.05)
+        start = off_by(0.3, (0.1, -0.08, 0.05))
+        found.append(refine(source, target, start, cell=0.25, agreeing=lambda T: 10))
+    assert len(off_by_then) == 4
+    fine = [one.icp.fine is not None for one in found if one.icp is not None]
+    # it is followed only where surfaces meet better by it
+    assert sum(fine) >= 2
+    then_, now = np.array(off_by_then), np.array([off(one.T) for one in found])
+    assert now.max() < 0.008
+    assert now[fine].mean() < 0.95 * then_[fine].mean()
+    for one in found:
+        assert one.icp is not None
+        if one.icp.fine is not None:
+            assert one.icp.fine_voxel_m == pytest.approx(4.0 / np.sqrt(400.0), rel=0.4)
+            assert one.icp.audit()["fine"]["voxel_m"] == one.icp.fine_voxel_m
+
+
+def test_sparse_clouds_get_no_finer_round(clouds) -> None:
+    source, target = clouds
+    assert fine_voxel(source, target, np.eye(4)) > RefineSettings().voxel_m
+    found = refine(source, target, off_by(0.2, (0.3, -0.2, 0.1)), agreeing=lambda T: 10)
+    assert found.icp is not None
+    assert found.icp.followed
+    assert found.icp.fine is None
+    assert found.icp.fine_voxel_m is None
+
+
+def test_the_finest_voxel_has_a_limit_and_the_sparser_cloud_decides() -> None:
+    rng = np.random.default_rng(6)
+    dense, sparse = plot(rng, density=900.0), plot(rng, density=60.0)
+    assert fine_voxel(dense, dense, np.eye(4)) == FINEST_VOXEL_M
+    assert fine_voxel(dense, sparse, np.eye(4)) == fine_voxel(sparse, dense, np.eye(4)) > 0.4

@@ -1,0 +1,158 @@
+"""The search on small plots, on sites that repeat themselves, mirrored, and with both clouds exchanged."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers_plots import planting, plot
+from helpers_scene import town
+
+import mtpcr_geo as mg
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.types import Bev, Hypothesis, Matches
+from mtpcr_geo.match.correlation import (
+    Candidate,
+    CorrelationSettings,
+    Pool,
+    Prior,
+    match,
+    mirror,
+)
+from mtpcr_geo.match.pose import Pose
+from mtpcr_geo.match.terrain import GroundComparison
+from mtpcr_geo.method.bev import grid_around, rasterise
+
+
+def bev_of(xyz: np.ndarray, cell: float) -> Bev:
+    return rasterise([xyz], grid_around(*transforms.bounds(xyz), cell))
+
+
+def moved_by(yaw_deg: float) -> np.ndarray:
+    return transforms.compose(transforms.yaw_matrix(np.radians(yaw_deg)), np.array([60.0, -25.0, 4.0]))
+
+
+def transform_of(hypothesis: Hypothesis) -> np.ndarray:
+    return transforms.compose(transforms.yaw_matrix(hypothesis.yaw), np.array([*hypothesis.shift, 0.0]))
+
+
+def off(found: np.ndarray, T_moved: np.ndarray, at: np.ndarray) -> tuple[float, float]:
+    """Yaw, degrees, and distance in plan, metres, by which a pose misses, where the (3,) point lies."""
+    rest = found @ T_moved
+    plan = (transforms.apply(rest, at[None]) - at)[0, :2]
+    return abs(float(np.degrees(transforms.yaw_of(rest[:3, :3])))), float(np.hypot(*plan))
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 75.0, 163.0, 290.0])
+def test_a_plot_of_25_m_is_found_at_any_yaw(yaw_deg: float) -> None:
+    rng = np.random.default_rng(1)
+    T_moved = moved_by(yaw_deg)
+    source, target = plot(rng), plot(rng)
+    found = match(bev_of(transforms.apply(T_moved, source), 0.25), bev_of(target, 0.25))
+    yaw, plan = off(transform_of(found.hypotheses[0]), T_moved, np.zeros(3))
+    assert yaw < 1.0
+    assert plan < 0.1
+    assert len(found.source_px) >= 20
+    assert found.margin is not None
+    assert found.margin > 2.0
+    assert found.null_ratio is not None
+    assert found.null_ratio > 2.0
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 77.0])
+def test_the_terrain_tells_one_period_of_a_planting_from_the_next(yaw_deg: float) -> None:
+    rng = np.random.default_rng(2)
+    T_moved = moved_by(yaw_deg)
+    source = planting(rng, (16.0, -40.0), (86.0, 40.0))
+    target = planting(rng, (-40.0, -40.0), (40.0, 40.0))
+    found = match(bev_of(transforms.apply(T_moved, source), 1.0), bev_of(target, 1.0))
+    yaw, plan = off(transform_of(found.hypotheses[0]), T_moved, np.array([28.0, 0.0, 0.0]))
+    assert yaw < 1.0
+    assert plan < 0.5
+    assert found.margin is not None
+    assert found.margin > 1.5
+    # rows fit rows: but for the ground the mirrored planting fits as well, and that is said
+    assert found.null_ratio is not None
+    assert found.null_ratio < 1.6
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 77.0])
+def test_a_planting_that_is_not_the_same_is_never_accepted(yaw_deg: float) -> None:
+    rng = np.random.default_rng(2)
+    source = planting(rng, (50.0, -40.0), (110.0, 40.0), 4.0)
+    target = planting(rng, (-40.0, -40.0), (40.0, 40.0), 4.0)
+    found = mg.register(transforms.apply(moved_by(yaw_deg), source), target, cell=1.0)
+    assert found.verdict.name != "accepted"
+    assert found.verdict.reasons
+
+
+@pytest.fixture(scope="module")
+def towns() -> tuple[np.ndarray, np.ndarray]:
+    """Two samples of one town of which the first shows a part."""
+    rng = np.random.default_rng(0)
+    source, target = town(rng, 90_000, 200.0), town(rng, 90_000, 200.0)
+    return transforms.apply(moved_by(121.5), source[(source[:, 0] > -20) & (source[:, 1] < 40)]), target
+
+
+@pytest.fixture(scope="module")
+def found(towns: tuple[np.ndarray, np.ndarray]) -> Matches:
+    return match(bev_of(towns[0], 1.0), bev_of(towns[1], 1.0))
+
+
+def test_reflecting_twice_gives_the_raster_back(towns: tuple[np.ndarray, np.ndarray]) -> None:
+    bev = bev_of(towns[0], 1.0)
+    once, twice = mirror(bev), mirror(mirror(bev))
+    assert twice.grid == bev.grid
+    for a, b in ((twice.top, bev.top), (twice.low, bev.low), (twice.count, bev.count)):
+        assert np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+    assert not np.array_equal(once.count, bev.count)
+    # what lies at x comes to lie at -x, at the same y and height
+    of_points = rasterise([towns[0] * [-1.0, 1.0, 1.0]], once.grid)
+    assert (of_points.count == once.count).mean() > 0.999
+
+
+def test_a_mirrored_town_fits_nowhere_near_as_well(found: Matches) -> None:
+    assert found.null_ratio is not None
+    assert found.null_ratio > 2.0
+    assert found.report["null_ratio"] == found.null_ratio
+    assert max(found.report["mirrored_strengths"]) < found.report["strengths"][0] / 2
+
+
+def test_the_mirrored_search_changes_no_match(towns: tuple[np.ndarray, np.ndarray], found: Matches) -> None:
+    source, target = (bev_of(xyz, 1.0) for xyz in towns)
+    without = match(source, target, CorrelationSettings(mirrored_null=False))
+    assert without.null_ratio is None
+    assert without.report["mirrored_strengths"] is None
+    assert without.hypotheses == found.hypotheses
+    assert np.array_equal(without.source_px, found.source_px)
+    near = match(source, target, prior=Prior(found.hypotheses[0], 10.0, 0.1))
+    assert near.null_ratio is None
+
+
+def test_exchanged_clouds_give_the_inverse(towns: tuple[np.ndarray, np.ndarray], found: Matches) -> None:
+    exchanged = match(bev_of(towns[1], 1.0), bev_of(towns[0], 1.0))
+    there, back = (transform_of(one.hypotheses[0]) for one in (found, exchanged))
+    centre = towns[1].mean(axis=0)
+    yaw, plan = off(there, back, centre)
+    assert yaw < 0.5
+    assert plan < 1.0
+    assert exchanged.null_ratio is not None
+    assert exchanged.null_ratio > 2.0
+
+
+def test_grounds_that_disagree_weigh_a_hypothesis_down() -> None:
+    class Judged(Candidate):
+        @property
+        def strength(self) -> float:
+            return self.pose.score
+
+    def judged(score: float, east: float, spread_m: float, cells: int = 50) -> Candidate:
+        return Judged(Pose(0.0, east, 0.0, score), ground=GroundComparison(cells, spread_m))
+
+    right, wrong, same = judged(80.0, 0.0, 0.1), judged(100.0, 50.0, 0.9), judged(70.0, 1.0, 0.1)
+    pool = Pool.of([wrong, same, right], 5.0)
+    assert pool.candidates == (right, wrong)
+    assert pool.margin > 5.0
+    # ground that is not known counts for little and against little
+    unknown = Pool.of([judged(80.0, 0.0, np.inf, 0), judged(50.0, 50.0, np.inf, 0)], 5.0)
+    assert unknown.margin == pytest.approx(1.6)
+    assert Pool.of([], 5.0).margin == 1.0

@@ -1,0 +1,199 @@
+"""The shape of the ground as evidence: made-up terrains, smooth and unlike anywhere else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.types import Bev, Hypothesis
+from mtpcr_geo.match.pose import Pose, centre_of, pose_of
+from mtpcr_geo.match.search import angle_between
+from mtpcr_geo.match.terrain import FEWEST_CELLS, Terrain, TerrainSearch, compare_ground, place_on
+from mtpcr_geo.method.bev import grid_around, rasterise
+
+CELL = 4.0
+YAW = np.radians(143.0)
+SHIFT = np.array([420.0, -310.0, 55.0])
+T_MOVED = transforms.compose(transforms.yaw_matrix(YAW), SHIFT)
+BACK = transforms.inverse(T_MOVED)
+TRUE = Hypothesis(transforms.yaw_of(BACK[:3, :3]), (float(BACK[0, 3]), float(BACK[1, 3])), 0.0, 0)
+"""What takes the moved source back to the target."""
+
+
+def relief(xy: np.ndarray, scale: float = 1.0) -> np.ndarray:
+    """Heights of hills 40 to 120 m long at (n, 2) places, the same for every call, metres."""
+    rng = np.random.default_rng(17)
+    z = np.zeros(len(xy))
+    for _ in range(24):
+        direction, length = rng.uniform(0.0, 2 * np.pi), rng.uniform(40.0, 120.0)
+        along = xy @ np.array([np.cos(direction), np.sin(direction)])
+        z += length / 120.0 * np.sin(2 * np.pi * along / length + rng.uniform(0.0, 2 * np.pi))
+    return scale * z
+
+
+def ground(seed: int, low: tuple[float, float], high: tuple[float, float], scale: float = 1.0) -> np.ndarray:
+    """(n, 3) points on the ground, 2 a square metre, rough by 2 cm."""
+    rng = np.random.default_rng(seed)
+    n = round(2 * np.prod(np.subtract(high, low)))
+    xy = rng.uniform(low, high, (n, 2))
+    return np.column_stack([xy, relief(xy, scale) + rng.normal(0.0, 0.02, n)])
+
+
+def bev_of(xyz: np.ndarray) -> Bev:
+    return rasterise([xyz], grid_around(*transforms.bounds(xyz), 1.0))
+
+
+def terrain_of(xyz: np.ndarray) -> Terrain:
+    return Terrain.of(bev_of(xyz), CELL)
+
+
+def holed(xyz: np.ndarray) -> np.ndarray:
+    """The cloud with holes of 18 m, and without a corner."""
+    rng = np.random.default_rng(23)
+    low, high = transforms.bounds(xyz)
+    keep = (xyz[:, :2] - low[:2]).sum(axis=1) > 0.2 * (high[:2] - low[:2]).sum()
+    for _ in range(8):
+        keep &= np.hypot(*(xyz[:, :2] - rng.uniform(low[:2], high[:2])).T) > 9.0
+    return xyz[keep]
+
+
+@pytest.fixture(scope="module")
+def target() -> np.ndarray:
+    return ground(1, (-100.0, -100.0), (100.0, 100.0))
+
+
+@pytest.fixture(scope="module")
+def source() -> np.ndarray:
+    """Another sample, which reaches over the target's eastern edge; turned and moved."""
+    return transforms.apply(T_MOVED, ground(2, (20.0, -60.0), (140.0, 60.0)))
+
+
+def best_of(source: Terrain, target: Terrain, step_deg: float = 4.0) -> tuple[Pose, list[Pose]]:
+    found = TerrainSearch(source, target, 100).run(np.radians(np.arange(0.0, 360.0, step_deg)))
+    return found[0], found
+
+
+def assert_right(pose: Pose, source: Terrain, within_m: float = 1.5 * CELL) -> None:
+    true = pose_of(TRUE, centre_of(source.grid))
+    assert np.degrees(angle_between(pose.yaw, true.yaw)) <= 4.0
+    assert np.hypot(pose.east - true.east, pose.north - true.north) <= within_m
+
+
+def test_yaw_and_shift_are_found(source: np.ndarray, target: np.ndarray) -> None:
+    s, t = terrain_of(source), terrain_of(target)
+    best, found = best_of(s, t)
+    assert_right(best, s)
+    others = [p for p in found if angle_between(p.yaw, TRUE.yaw) > np.radians(12.0)]
+    assert best.score > 1.5 * max(p.score for p in others)
+
+
+def test_holes_do_no_harm(source: np.ndarray, target: np.ndarray) -> None:
+    s, t = terrain_of(holed(source)), terrain_of(holed(target))
+    for cloud, terrain in ((source, s), (target, t)):
+        assert 0.6 < terrain.mask.sum() / terrain_of(cloud).mask.sum() < 0.96
+    assert_right(best_of(s, t)[0], s)
+
+
+def test_a_mountain_does_not_drown_in_round_off() -> None:
+    s = terrain_of(transforms.apply(T_MOVED, ground(2, (20.0, -60.0), (140.0, 60.0), 60.0)))
+    t = terrain_of(ground(1, (-100.0, -100.0), (100.0, 100.0), 60.0))
+    assert np.ptp(t.low) > 400.0
+    assert_right(best_of(s, t)[0], s)
+
+
+def test_heights_of_another_datum_change_nothing(source: np.ndarray, target: np.ndarray) -> None:
+    t = terrain_of(target)
+    a, _ = best_of(terrain_of(source), t)
+    b, _ = best_of(terrain_of(source + [0.0, 0.0, 700.0]), t)
+    assert (b.yaw, b.east, b.north) == (a.yaw, a.east, a.north)
+    assert b.score == pytest.approx(a.score, rel=1e-2)
+    shape = compare_ground(terrain_of(source), t, TRUE)
+    raised = compare_ground(terrain_of(source + [0.0, 0.0, 700.0]), t, TRUE)
+    assert raised.spread_m == pytest.approx(shape.spread_m, abs=1e-3)
+
+
+def test_a_pose_reads_the_same_about_another_centre(source: np.ndarray, target: np.ndarray) -> None:
+    s, t = terrain_of(source), terrain_of(target)
+    best, _ = best_of(s, t)
+    grid = grid_around(np.array([400.0, -300.0]), np.array([433.0, -278.0]), 1.0)
+    a, b = best.hypothesis(centre_of(s.grid)), place_on(best, s, grid).hypothesis(centre_of(grid))
+    assert np.allclose(a.shift, b.shift)
+    assert a.yaw == b.yaw
+
+
+def test_the_true_pose_has_the_least_spread(source: np.ndarray, target: np.ndarray) -> None:
+    s, t = terrain_of(source), terrain_of(target)
+    true = compare_ground(s, t, TRUE)
+    assert true.known
+    assert true.cells > 200
+    pivot = centre_of(s.grid)
+    at = pose_of(TRUE, pivot)
+    for turn, east, north in ((0.0, 16.0, 0.0), (0.0, 0.0, -16.0), (20.0, 0.0, 0.0), (180.0, 0.0, 0.0)):
+        wrong = Pose(at.yaw + np.radians(turn), at.east + east, at.north + north).hypothesis(pivot)
+        assert compare_ground(s, t, wrong).spread_m > 2 * true.spread_m
+
+
+def test_a_tilt_is_taken_out_where_the_vertical_is_not_trusted(
+    source: np.ndarray, target: np.ndarray
+) -> None:
+    s, t = terrain_of(source), terrain_of(target)
+    middle = source.mean(axis=0)
+    leaning = source + np.column_stack(
+        [np.zeros((len(source), 2)), (source[:, :2] - middle[:2]) @ np.array([0.12, -0.05])]
+    )
+    tilted = terrain_of(leaning)
+    upright = compare_ground(s, t, TRUE).spread_m
+    leant = compare_ground(tilted, t, TRUE).spread_m
+    assert leant > 20 * upright
+    # not quite as upright: on a tilted cloud another point of a cell is its lowest
+    assert compare_ground(tilted, t, TRUE, plane=True).spread_m < leant / 8
+    # and a plane does not hide a wrong pose
+    pivot = centre_of(s.grid)
+    at = pose_of(TRUE, pivot)
+    wrong = replace(at, yaw=at.yaw + np.pi).hypothesis(pivot)
+    assert compare_ground(tilted, t, wrong, plane=True).spread_m > leant / 3
+
+
+def test_a_plane_is_not_led_off_by_what_stands_on_the_ground(source: np.ndarray, target: np.ndarray) -> None:
+    s, t = terrain_of(source), terrain_of(target)
+    plain = compare_ground(s, t, TRUE, plane=True).spread_m
+    column = np.arange(t.grid.width)
+    hedged = replace(t, low=t.low + np.where(column > 0.93 * t.grid.width, 6.0, 0.0).astype(np.float32))
+    assert compare_ground(s, hedged, TRUE, plane=True).spread_m < 2 * plain
+
+
+def test_flat_ground_knows_nothing() -> None:
+    s, t = (terrain_of(ground(seed, (-80.0, -80.0), (80.0, 80.0), 0.0)) for seed in (1, 2))
+    _, found = best_of(s, t, 20.0)
+    # any pose is as good as another: less than chance of one in e for each cell
+    assert all(abs(pose.score) < 0.05 * pose.overlap_cells for pose in found)
+    spreads = [
+        compare_ground(s, t, Hypothesis(yaw, shift, 0.0, 0)).spread_m
+        for yaw in (0.0, 1.0, 3.0)
+        for shift in ((0.0, 0.0), (30.0, -20.0))
+    ]
+    assert max(spreads) < 0.05
+
+
+def test_too_little_ground_is_said_to_be_unknown(source: np.ndarray, target: np.ndarray) -> None:
+    t = terrain_of(target)
+    beside = replace(TRUE, shift=(TRUE.shift[0] + 900.0, TRUE.shift[1]))
+    nothing = compare_ground(terrain_of(source), t, beside)
+    assert not nothing.known
+    assert nothing.cells == 0
+    few = compare_ground(
+        terrain_of(ground(3, (0.0, 0.0), (7.0, 7.0))), t, Hypothesis(0.0, (0.0, 0.0), 0.0, 0)
+    )
+    assert not few.known
+    assert few.cells < FEWEST_CELLS
+    assert few.spread_m == np.inf
+
+
+def test_a_search_without_overlap_enough_finds_nothing(source: np.ndarray, target: np.ndarray) -> None:
+    s, t = terrain_of(source), terrain_of(target)
+    assert TerrainSearch(s, t, s.mask.sum() + 1).run([0.0, 1.0]) == []
+    empty = replace(s, mask=np.zeros_like(s.mask), low=np.zeros_like(s.low))
+    assert TerrainSearch(empty, t, 1).run([0.0, 1.0]) == []
