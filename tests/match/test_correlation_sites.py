@@ -21,6 +21,7 @@ from mtpcr_geo.match.correlation import (
 from mtpcr_geo.match.pose import Pose
 from mtpcr_geo.match.terrain import GroundComparison
 from mtpcr_geo.method.bev import grid_around, rasterise
+from mtpcr_geo.method.scales import Scales
 
 
 def bev_of(xyz: np.ndarray, cell: float) -> Bev:
@@ -149,10 +150,11 @@ def test_grounds_that_disagree_weigh_a_hypothesis_down() -> None:
         return Judged(Pose(0.0, east, 0.0, score), ground=GroundComparison(cells, spread_m))
 
     right, wrong, same = judged(80.0, 0.0, 0.1), judged(100.0, 50.0, 0.9), judged(70.0, 1.0, 0.1)
-    pool = Pool.of([wrong, same, right], 5.0)
+    scales = Scales(1.0, 20.0, 12.0, 3.0, 100.0, 4.0, same_pose_m=5.0)
+    pool = Pool.of([wrong, same, right], scales)
     assert pool.candidates == (right, wrong)
     assert pool.margin > 5.0
     # ground that is not known counts for little and against little
-    unknown = Pool.of([judged(80.0, 0.0, np.inf, 0), judged(50.0, 50.0, np.inf, 0)], 5.0)
+    unknown = Pool.of([judged(80.0, 0.0, np.inf, 0), judged(50.0, 50.0, np.inf, 0)], scales)
     assert unknown.margin == pytest.approx(1.6)
-    assert Pool.of([], 5.0).margin == 1.0
+    assert Pool.of([], scales).margin == 1.0
