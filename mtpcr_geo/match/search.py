@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core.arrays import Image
 from mtpcr_geo.core.grid import Grid
+from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.match.pose import Pose, centre_of, warp_to
 from mtpcr_geo.method.images import Channels
 
@@ -69,15 +70,17 @@ class GlobalSearch:
     Args:
         source, target: channels on grids of one cell size.
         min_overlap_cells: overlaps below this are not considered.
-        workers: threads among which the yaws are shared.
+        workers: threads among which the yaws are shared; all cores if None. Results do not depend on it.
 
     """
 
-    def __init__(self, source: Layer, target: Layer, min_overlap_cells: float, workers: int = 2) -> None:
+    def __init__(
+        self, source: Layer, target: Layer, min_overlap_cells: float, workers: int | None = None
+    ) -> None:
         self.source = source
         self.target = target
         self.min_overlap = max(min_overlap_cells, 1.0)
-        self.workers = workers
+        self.workers = workers or usable_cores()
         side = int(np.ceil(np.hypot(*source.grid.shape))) + 2
         self._turned_side = side
         height, width = target.grid.shape

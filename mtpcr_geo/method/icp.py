@@ -11,6 +11,7 @@ import numpy as np
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import RegistrationError
+from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import IcpMethod, IcpRound
 from mtpcr_geo.method.downsample import near, thinned
 from mtpcr_geo.method.neighbourhoods import local_shapes
@@ -73,7 +74,7 @@ class Surfaces:
         voxel_m: thinning, metres.
         max_correspondence_distance_m: farthest correspondence to be asked for, metres.
         max_points: of the source after thinning; the target, which costs less, may have three times as many.
-        threads: for thinning and surfaces.
+        threads: for thinning and surfaces; all cores if None. Results do not depend on it.
 
     Raises:
         RegistrationError: if the clouds hardly overlap under the start.
@@ -89,7 +90,7 @@ class Surfaces:
         voxel_m: float = 0.5,
         max_correspondence_distance_m: float = FAR_DISTANCES_M[0],
         max_points: int = 30_000,
-        threads: int = 2,
+        threads: int | None = None,
     ) -> None:
         import small_gicp
 
@@ -107,7 +108,7 @@ class Surfaces:
             )
         self.T_start = T_start
         self.voxel_m = voxel_m
-        self._threads = threads
+        self._threads = threads or usable_cores()
         self._pivot = np.floor(target[of_target].mean(axis=0))
         # each cloud is thinned in its own frame, so that a hair's breadth at the start changes no point
         s = transforms.apply(T_start, thinned(source[of_source], of_source, voxel_m, max_points))

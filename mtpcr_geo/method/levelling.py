@@ -14,6 +14,7 @@ import numpy as np
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import Levelling
 from mtpcr_geo.method.downsample import one_per_voxel
 from mtpcr_geo.method.neighbourhoods import local_shapes
@@ -25,11 +26,13 @@ PLANE_TOLERANCE_M = 0.4
 FEWEST_ON_PLANE = 0.2
 """Share of the points on the ground plane below which it is one field among many, and says nothing."""
 NEIGHBOURS = 14
-THREADS = 2
 SHAPE_POINTS = 25_000
 FEWEST_VERTICALS = 60
 PLUMB_WITHIN_DEG = 20.0
 PLUMB_SIGMA_DEG = 1.5
+WORST_SPREAD_DEG = 2.3
+"""Robust spread about the vertical above which what leans that much is no evidence of it: crowns and branches
+of sparse trees spread evenly over the 4.5 degrees that count as agreeing, walls and trunks by 0.8 to 2."""
 WORST_CONDITION = 0.04
 """Share of the vertical evidence that must speak for the less well seen of the two tilt directions."""
 
@@ -140,8 +143,9 @@ def plumb_line(xyz: Floats, about: Floats, rng: np.random.Generator) -> PlumbLin
     if len(xyz) < 10 * NEIGHBOURS:
         return nothing
     chosen = xyz if len(xyz) <= SHAPE_POINTS else xyz[rng.choice(len(xyz), SHAPE_POINTS, replace=False)]
-    tree = small_gicp.KdTree(xyz, THREADS)
-    spread, vectors = local_shapes(tree, xyz, chosen, NEIGHBOURS, THREADS)
+    threads = usable_cores()
+    tree = small_gicp.KdTree(xyz, threads)
+    spread, vectors = local_shapes(tree, xyz, chosen, NEIGHBOURS, threads)
     flat = (spread[:, 1] > 4 * spread[:, 0]) & (spread[:, 1] > 0.3 * spread[:, 2])
     thin_ = spread[:, 2] > 5 * spread[:, 1]
     within = np.sin(np.radians(PLUMB_WITHIN_DEG))
@@ -176,7 +180,8 @@ def plumb_line(xyz: Floats, about: Floats, rng: np.random.Generator) -> PlumbLin
         or count < 0.3 * len(lean)
     ):
         return PlumbLine(None, count, None)
-    return PlumbLine(up, count, float(1.4826 * np.median(np.abs(lean[agree]))))
+    about_up = float(1.4826 * np.median(np.abs(lean[agree])))
+    return PlumbLine(up if about_up <= WORST_SPREAD_DEG else None, count, about_up)
 
 
 def rotation_to_up(up: Floats) -> Floats:

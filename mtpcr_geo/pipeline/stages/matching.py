@@ -14,7 +14,7 @@ from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.types import Appearance, Bev, Look, Pair, Side
 from mtpcr_geo.pipeline.options import MatcherName, Models, PriorKind, PriorSigma, PriorYaw, Seed
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
-from mtpcr_geo.pipeline.stages.solving import bevs_of, georeference
+from mtpcr_geo.pipeline.stages.pairs import bevs_of, georeference
 
 if TYPE_CHECKING:
     from mtpcr_geo.match.base import Matcher, View
