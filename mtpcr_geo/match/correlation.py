@@ -41,8 +41,8 @@ LEVELS = 3
 COARSEST_YAW_STEP_DEG, FINEST_YAW_STEP_DEG = 4.0, 2.0
 FEWEST_OVERLAP_CELLS = 20
 PEAKS_A_YAW = 3
-HYPOTHESES = 8
-TERRAIN_HYPOTHESES = 4
+HYPOTHESES = 10
+TERRAIN_HYPOTHESES = 6
 CLEAR_MARGIN = 4.0
 """Times by which the best strength exceeds a hypothesis' score, which bounds its strength, where patches need
 not be asked: the margin could not fall below this."""
