@@ -43,7 +43,7 @@ def test_a_scan_is_found_in_an_airborne_cloud_of_the_plot() -> None:
 
 def test_a_plot_of_other_trees_is_never_accepted() -> None:
     rng = np.random.default_rng(10)
-    target = plot(rng, 45.0, 60.0)
+    target = plot(rng, 36.0, 40.0)
     # two plots of one forest that share nothing
     west, east = target[target[:, 0] < -5.0], target[target[:, 0] > 5.0]
     found = mg.register(west, east)

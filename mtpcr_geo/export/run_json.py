@@ -179,6 +179,9 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.refine icp.fine.inliers``: points with a correspondence at its end
 - ``mtpcr.refine icp.fine.converged``: whether it stood still
 - ``mtpcr.refine icp.rotated_deg``: angle by which ICP turned the start
+- ``mtpcr.refine levelled_again``: whether the source was levelled by the vertical that ICP found, matched and
+  solved again; then the figures are those of the second refinement
+- ``mtpcr.refine tilt_deg``: angle between the source's z axis and that vertical
 - ``mtpcr.assess verdict``: as above
 - ``mtpcr.assess reasons``: as above
 - ``mtpcr.assess <metric>``: the metrics, as above

@@ -15,6 +15,7 @@ from mtpcr_geo.match.correlation import (
     CorrelationSettings,
     Pool,
     Prior,
+    _same,
     match,
     mirror,
 )
@@ -71,6 +72,9 @@ def test_the_terrain_tells_one_period_of_a_planting_from_the_next(yaw_deg: float
     assert plan < 0.5
     assert found.margin is not None
     assert found.margin > 1.5
+    # rows fit rows: what tells this pose from the next is the ground, seen by its spread
+    spreads = found.report["ground_spread_m"]
+    assert spreads[0] == min(one for one in spreads if one is not None)
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 77.0])
@@ -146,8 +150,11 @@ def test_grounds_that_disagree_weigh_a_hypothesis_down() -> None:
     def judged(score: float, east: float, spread_m: float, cells: int = 50) -> Candidate:
         return Judged(Pose(0.0, east, 0.0, score), ground=GroundComparison(cells, spread_m))
 
+    scales = Scales(
+        cell_m=1.0, extent_m=40.0, patch_m=12.0, search_radius_m=3.0, least_overlap_m2=300.0,
+        terrain_cell_m=5.0, same_pose_m=5.0,
+    )  # fmt: skip
     right, wrong, same = judged(80.0, 0.0, 0.1), judged(100.0, 50.0, 0.9), judged(70.0, 1.0, 0.1)
-    scales = Scales(1.0, 20.0, 12.0, 3.0, 100.0, 4.0, same_pose_m=5.0)
     pool = Pool.of([wrong, same, right], scales)
     assert pool.candidates == (right, wrong)
     assert pool.margin > 5.0
@@ -155,3 +162,14 @@ def test_grounds_that_disagree_weigh_a_hypothesis_down() -> None:
     unknown = Pool.of([judged(80.0, 0.0, np.inf, 0), judged(50.0, 50.0, np.inf, 0)], scales)
     assert unknown.margin == pytest.approx(1.6)
     assert Pool.of([], scales).margin == 1.0
+    # what was left unjudged may be as strong as its bound
+    assert Pool.of([right], scales, bound=20.0).margin == pytest.approx(pool.strengths[0] / 20.0)
+
+
+def test_poses_are_one_where_they_move_the_rim_alike() -> None:
+    here = Pose(0.0, 0.0, 0.0)
+    assert _same(here, Pose(2 * np.pi - 0.01, 1.0, 0.0), 5.0, np.inf)
+    assert not _same(here, Pose(0.0, 6.0, 0.0), 5.0, 20.0)
+    turned = Pose(np.radians(10.0), 1.0, 0.0)
+    assert _same(here, turned, 5.0, 20.0)
+    assert not _same(here, turned, 5.0, 200.0)
