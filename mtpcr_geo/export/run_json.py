@@ -86,7 +86,7 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.level <role>.noise_points``: of these, classified as noise (7, 18) or flagged withheld, and left
   out
 - ``mtpcr.level <role>.sampled``: points kept to work on
-- ``mtpcr.level <role>.method``: none, plane or verticals: what the cloud was levelled by
+- ``mtpcr.level <role>.method``: none, plane, verticals or refinement: what the cloud was levelled by
 - ``mtpcr.level <role>.tilt_deg``: angle between its z axis and the vertical found
 - ``mtpcr.level <role>.why``: why it was kept as it is, where it was
 - ``mtpcr.level <role>.trusted``: whether its vertical is known: by the CRS, or since the options say so

@@ -19,44 +19,34 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Mask
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
-from mtpcr_geo.core.statistics import chance_within, neg_log10_p
 from mtpcr_geo.core.types import Bev, Hypothesis, Matches
 from mtpcr_geo.match.base import margin_of
+from mtpcr_geo.match.candidates import AGREE_TOLERANCES, RADIUS_TOLERANCES, Candidate, Pool, same_pose
 from mtpcr_geo.match.patches import PatchMatches, match_patches
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
-from mtpcr_geo.match.search import GlobalSearch, Layer, angle_between, distinct, score_nearby
+from mtpcr_geo.match.pyramid import Pyramid, search_factors
+from mtpcr_geo.match.search import GlobalSearch, Layer, distinct, score_nearby
 from mtpcr_geo.match.terrain import FEWEST_CELLS as FEWEST_GROUND_CELLS
-from mtpcr_geo.match.terrain import GroundComparison, Terrain, TerrainSearch, compare_ground, place_on
-from mtpcr_geo.method.bev import coarsen
-from mtpcr_geo.method.images import channels
+from mtpcr_geo.match.terrain import Terrain, TerrainSearch, compare_ground, place_on
 from mtpcr_geo.method.scales import Scales, scales_of
 from mtpcr_geo.method.solve import iterative_svd, ransac_upright
 
-COARSEST_SEARCH_M = 8.0
-FEWEST_ACROSS = 40
-"""Cells along the smaller raster's longer side that the coarsest level of the search leaves at least."""
-LARGEST_SEARCH = 420
-"""Cells along a raster's side up to which a level is searched over all yaws in about two seconds."""
-LEVELS = 3
 COARSEST_YAW_STEP_DEG, FINEST_YAW_STEP_DEG = 4.0, 2.0
 FEWEST_OVERLAP_CELLS = 20
 PEAKS_A_YAW = 3
 HYPOTHESES = 10
 TERRAIN_HYPOTHESES = 6
+MIRRORED_HYPOTHESES = 24
+"""Hypotheses kept of a level of the mirrored search: where a scene repeats itself many score alike, and the
+best of them must be met."""
 CLEAR_MARGIN = 4.0
 """Times by which the best strength exceeds a hypothesis' score, which bounds its strength, where patches need
 not be asked: the margin could not fall below this."""
 SMALL_SITE_NEG_LOG10_P, SMALL_SITE_MARGIN, SMALL_SITE_SUPPORT = 8.0, 3.0, 0.5
 """What convinces where there are too few patches for `CorrelationSettings.convincing_neg_log10_p`."""
-RADIUS_TOLERANCES = 4.0
-"""How far the final patch matches may lie from where the pose puts them, tolerances."""
-AGREE_TOLERANCES = 1.5
 MAX_RADIUS_CELLS = 10
 ESTIMATE_CELLS = 20_000.0
 """Cells that tell which yaw and shift fit best on the way down to the finest level."""
-SAME_YAW_DEG = 5.0
-GROUND_SCALE_M = 0.1
-"""Spread of the ground's height differences, beyond the least of all hypotheses, that halves a strength."""
 
 
 @dataclass(frozen=True)
@@ -112,92 +102,6 @@ class Prior:
         return self.hypothesis.yaw + np.linspace(-self.yaw_range, self.yaw_range, count)
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """A hypothesis followed down to the finest cells.
-
-    Attributes:
-        pose: about the fine source raster's centre, with its score there.
-        patches: local matches under it, where it was judged by them.
-        supporting: (n,) patches that agree on one pose.
-        ground: how the shapes of both grounds compare under it.
-
-    """
-
-    pose: Pose
-    patches: PatchMatches | None = None
-    supporting: Mask | None = None
-    ground: GroundComparison | None = None
-
-    @property
-    def support(self) -> float:
-        """Share of all patches tried that agree on one pose, less the two that any pose can please."""
-        if self.patches is None or self.supporting is None:
-            return 0.0
-        return max(float(self.supporting.sum()) - 2.0, 0.0) / max(self.patches.patches, 8)
-
-    @property
-    def neg_log10_p(self) -> float:
-        """Minus log10 of the probability that so many of the matched patches agree by chance."""
-        if self.patches is None or self.supporting is None:
-            return 0.0
-        agreeing = max(int(self.supporting.sum()) - 2, 0)
-        chance = chance_within(AGREE_TOLERANCES, RADIUS_TOLERANCES - 0.5)
-        return neg_log10_p(agreeing, len(self.patches), chance)
-
-    @property
-    def strength(self) -> float:
-        """Score times support: what hypotheses are ranked by, before the ground is asked.
-
-        Repetitive scenes give high scores to wrong poses with a large overlap; their patches disagree.
-        """
-        return self.pose.score * self.support
-
-
-@dataclass(frozen=True)
-class Pool:
-    """Judged hypotheses, best first.
-
-    Attributes:
-        candidates: the hypotheses.
-        strengths: of each: score times support, times how well the ground agrees.
-        bound: no hypothesis left unjudged is stronger than this.
-
-    """
-
-    candidates: tuple[Candidate, ...] = ()
-    strengths: tuple[float, ...] = ()
-    bound: float = 0.0
-
-    @classmethod
-    def of(cls, candidates: Sequence[Candidate], scales: Scales, bound: float = 0.0) -> Pool:
-        """Rank candidates by strength and the ground, and join those that came down to the same place."""
-        known = [c.ground.spread_m for c in candidates if c.ground is not None and c.ground.known]
-        least = min(known, default=0.0)
-        weighed = [(c.strength * _ground_factor(c.ground, least), c) for c in candidates]
-        weighed.sort(key=lambda one: (-one[0], -one[1].pose.score))
-        kept: list[tuple[float, Candidate]] = []
-        for strength, candidate in weighed:
-            if not any(
-                _same(candidate.pose, other.pose, scales.same_pose_m, scales.extent_m / 2)
-                for _, other in kept
-            ):
-                kept.append((strength, candidate))
-        return cls(tuple(c for _, c in kept), tuple(s for s, _ in kept), bound)
-
-    @property
-    def margin(self) -> float:
-        """Strength of the best over that of the next distinct hypothesis, at least."""
-        return margin_of(self.strengths, floor=self.bound)
-
-
-def _ground_factor(ground: GroundComparison | None, least_m: float) -> float:
-    """Return 1 where the grounds agree as well as they do anywhere, less where they differ in shape."""
-    if ground is None or not ground.known:
-        return 0.5
-    return 1.0 / (1.0 + (ground.spread_m / (GROUND_SCALE_M + least_m)) ** 2)
-
-
 def match(
     source: Bev,
     target: Bev,
@@ -232,7 +136,16 @@ def match(
         )
     mirrored = None
     if settings.mirrored_null and prior is None:
-        twin = _Search(mirror(source), target, scales, settings, seed, advance, search.pyramid)
+        twin = _Search(
+            mirror(source),
+            target,
+            scales,
+            settings,
+            seed,
+            advance,
+            search.pyramid,
+            MIRRORED_HYPOTHESES,
+        )
         mirrored, _ = twin.explore(None, [level.factor for level in searched], pool.candidates[0].strength)
     best = pool.candidates[0]
     patches = best.patches
@@ -291,44 +204,6 @@ def mirror(bev: Bev) -> Bev:
     )
 
 
-class Pyramid:
-    """Both rasters' channels at every cell size asked for, made once."""
-
-    def __init__(self, source: Bev, target: Bev, shared: Pyramid | None = None) -> None:
-        self.source, self.target = source, target
-        self._source: dict[int, Layer] = {}
-        # a second source against the same target finds the target's channels made
-        self._target: dict[int, Layer] = {} if shared is None else shared._target
-
-    def at(self, factor: int) -> tuple[Layer, Layer]:
-        """Return source and target layers at ``factor`` times the finest cell."""
-        for bev, layers in ((self.source, self._source), (self.target, self._target)):
-            if factor not in layers:
-                coarse = coarsen(bev, factor)
-                layers[factor] = Layer(coarse.grid, channels(coarse))
-        return self._source[factor], self._target[factor]
-
-
-def search_factors(source: Bev, target: Bev) -> list[int]:
-    """Choose the levels of the global search, coarsest first, as multiples of the finest cell.
-
-    The coarsest leaves a few dozen cells along the smaller raster, each next one has half its cells, down to
-    the finest that can be searched over all yaws in about two seconds.
-    """
-    cell = source.grid.cell
-    longest = max(max(bev.grid.shape) for bev in (source, target))
-    shortest = min(max(bev.grid.shape) for bev in (source, target))
-    wanted = max(min(shortest / FEWEST_ACROSS, COARSEST_SEARCH_M / cell), 1.0)
-    affordable = max(1, int(np.ceil(longest / LARGEST_SEARCH)))
-    factors: list[int] = []
-    for _ in range(LEVELS):
-        factor = max(round(wanted), affordable)
-        if factor not in factors:
-            factors.append(factor)
-        wanted = max(wanted / 2.0, 1.0)
-    return factors
-
-
 @dataclass(frozen=True)
 class Level:
     """One level of a search.
@@ -357,9 +232,11 @@ class _Search:
         seed: int,
         advance: Callable[[int], object],
         shared: Pyramid | None = None,
+        keep: int = HYPOTHESES,
     ) -> None:
         self.pyramid = Pyramid(source, target, shared)
         self.scales, self.settings, self.seed, self.advance = scales, settings, seed, advance
+        self.keep = keep
         self.terrain_source = Terrain.of(source, scales.terrain_cell_m)
         self.terrain_target = Terrain.of(target, scales.terrain_cell_m)
 
@@ -423,7 +300,7 @@ class _Search:
             search.restrict(known.east, known.north, prior.radius_m)
             yaws = prior.yaws(step)
         poses = search.run(yaws, PEAKS_A_YAW, 4, self.advance)
-        return distinct(poses, HYPOTHESES, 2 * step, 5 * cell)
+        return distinct(poses, self.keep, 2 * step, 5 * cell)
 
     def _propose_by_terrain(self, factor: int) -> list[Pose]:
         """Propose the poses under which the grounds have the same shape, about the centre of a level."""
@@ -481,9 +358,10 @@ class _Search:
         """
         ranked = sorted(candidates, key=lambda c: -c.pose.score)
         separate: list[Candidate] = []
+        near = self.scales.same_pose_m / 4
         for candidate in ranked:
             if np.isfinite(candidate.pose.score) and not any(
-                _same(candidate.pose, other.pose, self.scales.same_pose_m / 4, np.inf) for other in separate
+                same_pose(candidate.pose, other.pose, near, np.inf) for other in separate
             ):
                 separate.append(candidate)
         judged: list[Candidate] = []
@@ -523,13 +401,6 @@ class _Search:
             plane=not settings.trust_vertical,
         )
         return Candidate(pose, patches, supporting, ground)
-
-
-def _same(a: Pose, b: Pose, apart_m: float, radius_m: float) -> bool:
-    """Return whether two poses are one: near in place, and in yaw or in what it moves at the rim."""
-    angle = angle_between(a.yaw, b.yaw)
-    near = float(np.hypot(a.east - b.east, a.north - b.north)) < apart_m
-    return near and (angle < np.radians(SAME_YAW_DEG) or angle * radius_m < apart_m)
 
 
 def _radius_cells(scales: Scales) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 from mtpcr_geo.core.arrays import Floats, Image
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Hypothesis
-from mtpcr_geo.match.pose import Pose, centre_of, warp_to
+from mtpcr_geo.match.pose import Pose, centre_of, pose_of, warp_to
 from mtpcr_geo.method.bev import coarsen
 
 NOISE_M = 0.1
@@ -178,6 +178,4 @@ class TerrainSearch:
 
 def place_on(pose: Pose, terrain: Terrain, grid: Grid) -> Pose:
     """Express a pose about the terrain's centre as one about the centre of another raster of the source."""
-    from mtpcr_geo.match.pose import pose_of
-
     return pose_of(pose.hypothesis(centre_of(terrain.grid)), centre_of(grid))

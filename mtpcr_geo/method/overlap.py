@@ -104,19 +104,48 @@ def _ground(xyz: Floats, bev: Bev) -> Floats:
     """Return the mean height of the lowest layer of each cell, (h, w) metres, NaN where empty.
 
     The single lowest point lies the lower the denser and the noisier a cloud is; the mean of what lies
-    little above it does not.
+    little above it does not. On a slope the layer is as much thicker as the ground rises within the cell.
     """
     grid = bev.grid
     column, row = grid.cells(xyz)
     inside = grid.holds(column, row)
     cell, z = row[inside] * grid.width + column[inside], xyz[inside, 2]
     low = bev.low.ravel()[cell]
-    layer = z - low <= GROUND_LAYER_M
+    thick = GROUND_LAYER_M + _slope(bev.low, grid.cell).ravel() * grid.cell
+    layer = z - low <= thick[cell]
     size = grid.width * grid.height
     count = np.bincount(cell[layer], minlength=size)
     total = np.bincount(cell[layer], (z - low)[layer], minlength=size)
     with np.errstate(invalid="ignore"):
         return np.asarray(bev.low.astype(np.float64) + (total / count).reshape(grid.shape))
+
+
+def _slope(low: NDArray[np.float32], cell: float) -> NDArray[np.float32]:
+    """Return the slope of the ground over some cells, rise over run, (h, w); 0 where it is not known."""
+    filled = np.isfinite(low)
+    if not filled.any():
+        return np.zeros(low.shape, np.float32)
+    lowest = _lowest_near(low, cell)
+    known = np.isfinite(lowest).astype(np.float32)
+    base = np.where(known > 0, lowest - np.float32(np.nanmedian(lowest)), np.float32(0))
+    sigma = max(SLOPE_RADIUS_M / cell, 1.0)
+    weight = cv2.GaussianBlur(known, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    smooth = cv2.GaussianBlur(base, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    smooth = smooth / np.maximum(weight, np.float32(1e-3))
+    east, north = (
+        cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx, ksize=3, borderType=cv2.BORDER_REPLICATE) for dx in (1, 0)
+    )
+    slope = np.minimum(np.hypot(east, north) / np.float32(8 * cell), np.float32(STEEPEST))
+    return np.asarray(slope, np.float32)
+
+
+def _lowest_near(low: NDArray[np.float32], cell: float) -> NDArray[np.float32]:
+    """Return the lowest height within some metres of each cell, NaN where there is none."""
+    radius = max(1, round(LOW_RADIUS_M / cell))
+    window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    height = np.where(np.isfinite(low), low, np.float32(np.inf))
+    lowest = cv2.erode(height, window, borderType=cv2.BORDER_REPLICATE)
+    return np.where(np.isfinite(lowest), lowest, np.float32(np.nan)).astype(np.float32)
 
 
 def _lies_low(low: NDArray[np.float32], cell: float, above: float = LOW_ABOVE_M) -> Mask:
@@ -132,25 +161,6 @@ def _lies_low(low: NDArray[np.float32], cell: float, above: float = LOW_ABOVE_M)
     if not filled.any():
         return filled
     radius = max(1, round(LOW_RADIUS_M / cell))
-    window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
-    height = np.where(filled, low, np.float32(np.inf))
-    lowest = cv2.erode(height, window, borderType=cv2.BORDER_REPLICATE)
-    lowest = np.where(np.isfinite(lowest), lowest, np.float32(np.nan))
-    # the slope of the ground over some cells; where it is not known, none
-    known = np.isfinite(lowest).astype(np.float32)
-    middle = np.float32(np.nanmedian(lowest))
-    base = np.where(known > 0, lowest - middle, np.float32(0))
-    sigma = max(SLOPE_RADIUS_M / cell, 1.0)
-    weight = cv2.GaussianBlur(known, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
-    smooth = cv2.GaussianBlur(base, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
-    smooth = smooth / np.maximum(weight, np.float32(1e-3))
-    east = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, borderType=cv2.BORDER_REPLICATE) / np.float32(
-        8 * cell
-    )
-    north = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, borderType=cv2.BORDER_REPLICATE) / np.float32(
-        8 * cell
-    )
-    slope = np.minimum(np.hypot(east, north), np.float32(STEEPEST))
-    allowed = np.float32(above) + slope * np.float32(radius * cell)
+    allowed = np.float32(above) + _slope(low, cell) * np.float32(radius * cell)
     with np.errstate(invalid="ignore"):
-        return np.asarray(filled & (low - lowest < allowed))
+        return np.asarray(filled & (low - _lowest_near(low, cell) < allowed))

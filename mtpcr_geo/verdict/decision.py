@@ -151,8 +151,8 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
         doubts.append(f"only {ground:.0%} of the ground that both clouds see agrees in height")
     if evidence.null_ratio is not None and evidence.null_ratio < limits.null_ratio:
         doubts.append(
-            "the mirrored source, which has no right pose, fits nearly as well "
-            f"({evidence.null_ratio:.2f} times weaker, wanted {limits.null_ratio:g})"
+            f"it fits only {evidence.null_ratio:.2f} times as well as the mirrored source, which has no "
+            f"right pose (wanted {limits.null_ratio:g})"
         )
     least = evidence.least_overlap_m2 if limits.overlap_m2 is None else limits.overlap_m2
     shared = f"the clouds share only {evidence.overlap_m2:.0f} m2 under this result, wanted {least:.0f}"

@@ -10,15 +10,8 @@ from helpers_scene import town
 import mtpcr_geo as mg
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.types import Bev, Hypothesis, Matches
-from mtpcr_geo.match.correlation import (
-    Candidate,
-    CorrelationSettings,
-    Pool,
-    Prior,
-    _same,
-    match,
-    mirror,
-)
+from mtpcr_geo.match.candidates import Candidate, Pool, same_pose
+from mtpcr_geo.match.correlation import CorrelationSettings, Prior, match, mirror
 from mtpcr_geo.match.pose import Pose
 from mtpcr_geo.match.terrain import GroundComparison
 from mtpcr_geo.method.bev import grid_around, rasterise
@@ -168,8 +161,8 @@ def test_grounds_that_disagree_weigh_a_hypothesis_down() -> None:
 
 def test_poses_are_one_where_they_move_the_rim_alike() -> None:
     here = Pose(0.0, 0.0, 0.0)
-    assert _same(here, Pose(2 * np.pi - 0.01, 1.0, 0.0), 5.0, np.inf)
-    assert not _same(here, Pose(0.0, 6.0, 0.0), 5.0, 20.0)
+    assert same_pose(here, Pose(2 * np.pi - 0.01, 1.0, 0.0), 5.0, np.inf)
+    assert not same_pose(here, Pose(0.0, 6.0, 0.0), 5.0, 20.0)
     turned = Pose(np.radians(10.0), 1.0, 0.0)
-    assert _same(here, turned, 5.0, 20.0)
-    assert not _same(here, turned, 5.0, 200.0)
+    assert same_pose(here, turned, 5.0, 20.0)
+    assert not same_pose(here, turned, 5.0, 200.0)
