@@ -19,6 +19,7 @@ from mtpcr_geo.method.bev import coarsen
 _MOST_CELLS = 500  # of a side of the left panel
 _DETAIL_CELLS = 300  # of a side of the right panel
 _LARGEST_DIFFERENCE_M = 2.0
+_GROUND_CELL_M = 1.0
 _FILLED_SHARE = 0.95
 _BLOCK_CELLS = 8
 _SOURCE_OPACITY = 0.75
@@ -75,6 +76,9 @@ def registration_figure(pair: Pair, title: str = "") -> RegistrationFigure:
 
 def _draw_difference(figure: Figure, axes: Axes, source: Bev, target: Bev) -> None:
     """Draw by how much the source lies above the target: red above, blue below, pale where they agree."""
+    # fine cells under a canopy hold branches more often than ground
+    join = max(1, round(_GROUND_CELL_M / source.grid.cell))
+    source, target = coarsen(source, join), coarsen(target, join)
     picture = axes.imshow(
         source.low - target.low,
         extent=_extent(source.grid),
