@@ -136,7 +136,7 @@ def crs_options(folder: Path, pair: dict[str, Any]) -> list[str]:
     for role in ("source", "target"):
         with laspy.open(folder / f"{role}.laz") as file:
             if file.header.parse_crs() is None:
-                code = re.search(r"EPSG:\d+", pair["crs"])
+                code = re.search(r"EPSG:\d+(?:\+\d+)?", pair["crs"])
                 local = f"{role} local" in pair["crs"] or code is None
                 options += [f"--{role}-crs", "local" if local else code[0]]
     return options
