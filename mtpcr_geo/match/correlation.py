@@ -9,27 +9,25 @@ what chance and self-similarity score on this pair.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo.core import transforms
-from mtpcr_geo.core.arrays import Mask
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Hypothesis, Matches
 from mtpcr_geo.match.base import margin_of
-from mtpcr_geo.match.candidates import AGREE_TOLERANCES, RADIUS_TOLERANCES, Candidate, Pool, same_pose
-from mtpcr_geo.match.patches import PatchMatches, match_patches
+from mtpcr_geo.match.candidates import Candidate, Pool
+from mtpcr_geo.match.descent import follow
+from mtpcr_geo.match.judge import CLEAR_MARGIN, Judge
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
-from mtpcr_geo.match.pyramid import Pyramid, search_factors
-from mtpcr_geo.match.search import GlobalSearch, Layer, distinct, score_nearby
+from mtpcr_geo.match.pyramid import Level, Pyramid, search_factors
+from mtpcr_geo.match.search import GlobalSearch, Layer, distinct
 from mtpcr_geo.match.terrain import FEWEST_CELLS as FEWEST_GROUND_CELLS
-from mtpcr_geo.match.terrain import Terrain, TerrainSearch, compare_ground, place_on
+from mtpcr_geo.match.terrain import Terrain, TerrainSearch, place_on
 from mtpcr_geo.method.scales import Scales, scales_of
-from mtpcr_geo.method.solve import iterative_svd, ransac_upright
 
 COARSEST_YAW_STEP_DEG, FINEST_YAW_STEP_DEG = 4.0, 2.0
 FEWEST_OVERLAP_CELLS = 20
@@ -39,14 +37,11 @@ TERRAIN_HYPOTHESES = 6
 MIRRORED_HYPOTHESES = 24
 """Hypotheses kept of a level of the mirrored search: where a scene repeats itself many score alike, and the
 best of them must be met."""
-CLEAR_MARGIN = 4.0
-"""Times by which the best strength exceeds a hypothesis' score, which bounds its strength, where patches need
-not be asked: the margin could not fall below this."""
 SMALL_SITE_NEG_LOG10_P, SMALL_SITE_MARGIN, SMALL_SITE_SUPPORT = 8.0, 3.0, 0.5
 """What convinces where there are too few patches for `CorrelationSettings.convincing_neg_log10_p`."""
-MAX_RADIUS_CELLS = 10
-ESTIMATE_CELLS = 20_000.0
-"""Cells that tell which yaw and shift fit best on the way down to the finest level."""
+PROMISING_NEG_LOG10_P, CONVINCING_NULL_RATIO = 4.0, 2.0
+"""Significance from which the mirrored source is asked before finer levels are searched, and the strength
+over it that ends the search: wrong poses have reached 1.5."""
 
 
 @dataclass(frozen=True)
@@ -128,40 +123,40 @@ def match(
     """
     scales = scales_of(source, target)
     search = _Search(source, target, scales, settings, seed, advance)
-    pool, searched = search.explore(prior)
+    twin = None
+    if settings.mirrored_null and prior is None:
+        twin = _Search(
+            mirror(source), target, scales, settings, seed, advance, search.pyramid, MIRRORED_HYPOTHESES
+        )
+    for factor in search_factors(source, target):
+        search.explore(factor, prior)
+        if search.convinces():
+            break
+        if twin is not None and search.promises():
+            twin.catch_up(search)
+            if search.over(twin) >= CONVINCING_NULL_RATIO:
+                break
+    pool = search.pool
     if not pool.candidates:
         raise RegistrationError(
             "no pose brings the two rasters to overlap enough to compare; the clouds may be too small or too "
             f"sparse for cells of {source.grid.cell:g} m: give a finer --cell, or larger clouds"
         )
-    mirrored = None
-    if settings.mirrored_null and prior is None:
-        twin = _Search(
-            mirror(source),
-            target,
-            scales,
-            settings,
-            seed,
-            advance,
-            search.pyramid,
-            MIRRORED_HYPOTHESES,
-        )
-        mirrored, _ = twin.explore(None, [level.factor for level in searched], pool.candidates[0].strength)
+    null_ratio = None
+    if twin is not None:
+        twin.catch_up(search)
+        null_ratio = search.over(twin)
     best = pool.candidates[0]
     patches = best.patches
     assert patches is not None  # hypotheses in a pool are judged by patches
     pivot = centre_of(source.grid)
-    radius = _radius_cells(scales) * source.grid.cell - source.grid.cell / 2
-    null_ratio = None
-    if mirrored is not None:
-        strongest = max((c.strength for c in mirrored.candidates), default=0.0)
-        null_ratio = margin_of([best.strength, strongest], floor=mirrored.bound)
+    radius = search.judge.radius_cells * source.grid.cell - source.grid.cell / 2
     report = {
         "cell_m": source.grid.cell,
         "extent_m": scales.extent_m,
         "patch_m": scales.patch_m if settings.patch_m is None else settings.patch_m,
         "search_radius_m": radius,
-        "searched": [{"cell_m": level.cell_m, "scores": list(level.scores)} for level in searched],
+        "searched": [{"cell_m": level.cell_m, "scores": list(level.scores)} for level in search.levels],
         "margin": pool.margin,
         "support": best.support,
         "neg_log10_p": best.neg_log10_p,
@@ -173,9 +168,7 @@ def match(
             round(c.ground.spread_m, 3) if c.ground is not None and c.ground.known else None
             for c in pool.candidates
         ],
-        "mirrored_strengths": None
-        if mirrored is None
-        else [round(c.strength, 3) for c in mirrored.candidates],
+        "mirrored_strengths": None if twin is None else [round(c.strength, 3) for c in twin.pool.candidates],
         "null_ratio": null_ratio,
     }
     return Matches(
@@ -204,22 +197,6 @@ def mirror(bev: Bev) -> Bev:
     )
 
 
-@dataclass(frozen=True)
-class Level:
-    """One level of a search.
-
-    Attributes:
-        factor: its cell as a multiple of the finest.
-        cell_m: its cell, metres.
-        scores: of the hypotheses it proposed.
-
-    """
-
-    factor: int
-    cell_m: float
-    scores: tuple[float, ...]
-
-
 class _Search:
     """Explores the levels of one source against one target."""
 
@@ -237,42 +214,76 @@ class _Search:
         self.pyramid = Pyramid(source, target, shared)
         self.scales, self.settings, self.seed, self.advance = scales, settings, seed, advance
         self.keep = keep
-        self.terrain_source = Terrain.of(source, scales.terrain_cell_m)
-        self.terrain_target = Terrain.of(target, scales.terrain_cell_m)
+        self.terrain = (Terrain.of(source, scales.terrain_cell_m), Terrain.of(target, scales.terrain_cell_m))
+        self.judge = Judge(
+            self.pyramid,
+            self.terrain,
+            scales,
+            patch_m=scales.patch_m if settings.patch_m is None else settings.patch_m,
+            search_radius_m=scales.search_radius_m
+            if settings.search_radius_m is None
+            else settings.search_radius_m,
+            trust_vertical=settings.trust_vertical,
+            seed=seed,
+        )
+        self.levels: list[Level] = []
+        self.judged: list[Candidate] = []
+        self.pool = Pool()
 
-    def explore(
-        self, prior: Prior | None, factors: Sequence[int] | None = None, known: float = 0.0
-    ) -> tuple[Pool, list[Level]]:
-        """Search level by level until a pose convinces; all of ``factors`` where they are given.
+    def explore(self, factor: int, prior: Prior | None, known: float = 0.0) -> None:
+        """Search one more level.
 
-        Hypotheses that cannot come near the strength ``known`` are not judged by patches.
+        Args:
+            factor: its cell as a multiple of the finest.
+            prior: what is known of the pose.
+            known: strength that matters; what cannot come within `CLEAR_MARGIN` of it is not followed.
+
         """
-        judged: list[Candidate] = []
-        pool, levels, bound = Pool(), [], 0.0
-        for factor in factors or search_factors(self.pyramid.source, self.pyramid.target):
-            found = self._propose(factor, prior)
-            cell = self.pyramid.source.grid.cell * factor
-            levels.append(Level(factor, cell, tuple(round(pose.score, 3) for pose in found)))
-            if not levels[1:] and prior is None:
-                found = [*found, *self._propose_by_terrain(factor)]
-            now, left = self._judge([self._descend(factor, pose) for pose in found], known)
-            judged, bound = [*judged, *now], max(bound, left)
-            known = max([known, *(candidate.strength for candidate in judged)])
-            pool = Pool.of(judged, self.scales, bound)
-            if factors is None and self._convinces(pool):
-                break
-        return pool, levels
+        proposed = self._propose(factor, prior)
+        by_terrain = self._propose_by_terrain(factor) if not self.levels and prior is None else []
+        cell = self.pyramid.source.grid.cell * factor
+        self.levels.append(Level(factor, cell, tuple(round(pose.score, 3) for pose in proposed)))
+        followed = [
+            follow(self.pyramid, factor, proposed, known / CLEAR_MARGIN),
+            follow(self.pyramid, factor, by_terrain),
+        ]
+        known = max([known, *(candidate.strength for candidate in self.judged)])
+        poses = [pose for descent in followed for pose in descent.poses]
+        now, left = self.judge.judge(poses, known)
+        self.judged += now
+        bound = max(self.pool.bound, left, *(descent.bound for descent in followed))
+        self.pool = Pool.of(self.judged, self.scales, bound)
 
-    def _convinces(self, pool: Pool) -> bool:
-        if not pool.candidates or pool.margin < self.settings.convincing_margin:
+    def catch_up(self, other: _Search) -> None:
+        """Search the levels that another has searched, as far as they matter beside what it found."""
+        known = other.pool.candidates[0].strength if other.pool.candidates else 0.0
+        for level in other.levels[len(self.levels) :]:
+            self.explore(level.factor, None, known)
+
+    def over(self, other: _Search) -> float:
+        """Return the strength of the best over the greatest of another search, at least."""
+        strongest = max((candidate.strength for candidate in other.pool.candidates), default=0.0)
+        return margin_of([self.pool.candidates[0].strength, strongest], floor=other.pool.bound)
+
+    def convinces(self) -> bool:
+        """Return whether the best hypothesis is beyond doubt by itself."""
+        if not self.pool.candidates or self.pool.margin < self.settings.convincing_margin:
             return False
-        best = pool.candidates[0]
+        best = self.pool.candidates[0]
         if best.neg_log10_p >= self.settings.convincing_neg_log10_p:
             return True
         return (
             best.neg_log10_p >= SMALL_SITE_NEG_LOG10_P
-            and pool.margin >= SMALL_SITE_MARGIN
+            and self.pool.margin >= SMALL_SITE_MARGIN
             and best.support >= SMALL_SITE_SUPPORT
+        )
+
+    def promises(self) -> bool:
+        """Return whether the best hypothesis stands out, so that the mirrored source may tell what by."""
+        return (
+            bool(self.pool.candidates)
+            and self.pool.margin >= self.settings.convincing_margin
+            and self.pool.candidates[0].neg_log10_p >= PROMISING_NEG_LOG10_P
         )
 
     def _yaw_step(self, source: Layer) -> float:
@@ -304,7 +315,7 @@ class _Search:
 
     def _propose_by_terrain(self, factor: int) -> list[Pose]:
         """Propose the poses under which the grounds have the same shape, about the centre of a level."""
-        source, target = self.terrain_source, self.terrain_target
+        source, target = self.terrain
         cell = source.grid.cell
         least = self.settings.min_overlap_m2
         least = self.scales.least_overlap_m2 if least is None else least
@@ -316,120 +327,3 @@ class _Search:
         found = distinct(poses, TERRAIN_HYPOTHESES, np.radians(2 * step), 3 * cell)
         grid = self.pyramid.at(factor)[0].grid
         return [place_on(pose, source, grid) for pose in found]
-
-    def _descend(self, factor: int, pose: Pose) -> Candidate:
-        """Follow a hypothesis from the level that proposed it to the finest cells."""
-        level, step = factor, 1.0
-        window = 2
-        while True:
-            source, target = self.pyramid.at(level)
-            tries = [
-                score_nearby(
-                    source,
-                    target,
-                    Pose(pose.yaw + np.radians(k * step), pose.east, pose.north),
-                    window,
-                    ESTIMATE_CELLS,
-                )[0]
-                for k in (-2, -1, 0, 1, 2)
-            ]
-            pose = max(tries, key=lambda p: p.score)
-            if level == 1:
-                return Candidate(score_nearby(source, target, pose, 1)[0])
-            finer = max(1, level // 2)
-            # the centre of the raster moves a little between levels: same pose, other pivot
-            hypothesis = pose.hypothesis(centre_of(source.grid))
-            pose = pose_of(hypothesis, centre_of(self.pyramid.at(finer)[0].grid))
-            level, step, window = finer, step / 2, 3
-
-    def _judge(self, candidates: Sequence[Candidate], known: float) -> tuple[list[Candidate], float]:
-        """Judge hypotheses by patches and by the ground, those of the highest score at fine cells first.
-
-        A strength is at most the score. What cannot come within `CLEAR_MARGIN` of the best is left with the
-        score as its bound, unjudged.
-
-        Args:
-            candidates: at the finest cells.
-            known: strength reached by any hypothesis so far.
-
-        Returns:
-            What was judged, and the highest score of what was not.
-
-        """
-        ranked = sorted(candidates, key=lambda c: -c.pose.score)
-        separate: list[Candidate] = []
-        near = self.scales.same_pose_m / 4
-        for candidate in ranked:
-            if np.isfinite(candidate.pose.score) and not any(
-                same_pose(candidate.pose, other.pose, near, np.inf) for other in separate
-            ):
-                separate.append(candidate)
-        judged: list[Candidate] = []
-        for candidate in separate:
-            if candidate.pose.score * CLEAR_MARGIN < known:
-                return judged, candidate.pose.score
-            judged.append(self._judge_one(candidate))
-            known = max(known, judged[-1].strength)
-        return judged, 0.0
-
-    def _judge_one(self, candidate: Candidate) -> Candidate:
-        """Match patches around a hypothesis, let them correct it, and match again from there."""
-        source, target = self.pyramid.at(1)
-        cell = source.grid.cell
-        settings, scales = self.settings, self.scales
-        patch = scales.patch_m if settings.patch_m is None else settings.patch_m
-        wide = scales.search_radius_m if settings.search_radius_m is None else settings.search_radius_m
-        stride = max(4, round(patch / 2 / cell))
-        pose = candidate.pose
-        narrow = _radius_cells(scales)
-        agree = AGREE_TOLERANCES * scales.tolerance_m
-        radius = min(max(narrow, round(wide / cell)), MAX_RADIUS_CELLS)
-        patches = match_patches(source, target, pose, window=radius, stride=stride)
-        corrected = _corrected(
-            pose, patches, _vote(patches, source, target, agree, self.seed), source, target, agree
-        )
-        rescored = score_nearby(source, target, corrected, 1)[0]
-        # patches that do not agree must not carry a good hypothesis away
-        if rescored.score >= pose.score:
-            pose = rescored
-        patches = match_patches(source, target, pose, window=narrow, stride=stride)
-        supporting = _vote(patches, source, target, agree, self.seed)
-        ground = compare_ground(
-            self.terrain_source,
-            self.terrain_target,
-            pose.hypothesis(centre_of(source.grid)),
-            plane=not settings.trust_vertical,
-        )
-        return Candidate(pose, patches, supporting, ground)
-
-
-def _radius_cells(scales: Scales) -> int:
-    """Return how far the final patch matches may lie from where the pose puts them, cells."""
-    return max(1, round(RADIUS_TOLERANCES * scales.tolerance_m / scales.cell_m))
-
-
-def _vote(patches: PatchMatches, source: Layer, target: Layer, agree_m: float, seed: int) -> Mask:
-    """Mark the patches that agree on one yaw and shift within ``agree_m`` metres."""
-    s, t = source.grid.to_metres(patches.source_px), target.grid.to_metres(patches.target_px)
-    return ransac_upright(s, t, agree_m, seed, 500)[1]
-
-
-def _corrected(
-    pose: Pose, patches: PatchMatches, supporting: Mask, source: Layer, target: Layer, agree_m: float
-) -> Pose:
-    """Fit yaw and shift to the patches, starting from those that agree."""
-    if supporting.sum() < 4:
-        return pose
-    flat = np.zeros((len(patches), 1))
-    solution = iterative_svd(
-        np.hstack([source.grid.to_metres(patches.source_px), flat]),
-        np.hstack([target.grid.to_metres(patches.target_px), flat]),
-        start=supporting,
-        weight=patches.score**2,
-        floor=agree_m,
-        upright=True,
-    )
-    east, north = transforms.apply(solution.T, np.array([[*centre_of(source.grid), 0.0]]))[0, :2]
-    return Pose(
-        transforms.yaw_of(solution.T[:3, :3]), float(east), float(north), pose.score, pose.overlap_cells
-    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from mtpcr_geo.core.arrays import Floats, Image
@@ -58,7 +59,10 @@ def match_patches(
     stack = target.channels.stack
     warped = warp_to(source.channels.stack, source.grid, grid, pose)
     mask = (warped[2] > FILLED).astype(np.float32)
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    # outside of what a patch can reach of the target, no shift compares anything
+    reach = cv2.dilate(stack[2], np.ones((2 * window + 1, 2 * window + 1), np.uint8))
+    both = (mask > 0) & (reach > 0)
+    rows, columns = np.flatnonzero(both.any(axis=1)), np.flatnonzero(both.any(axis=0))
     if not len(rows):
         return _nothing()
     row0, column0 = int(rows[0]), int(columns[0])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from mtpcr_geo.core.types import Bev
@@ -15,6 +17,22 @@ FEWEST_ACROSS = 40
 LARGEST_SEARCH = 420
 """Cells along a raster's side up to which a level is searched over all yaws in about two seconds."""
 LEVELS = 3
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of a search.
+
+    Attributes:
+        factor: its cell as a multiple of the finest.
+        cell_m: its cell, metres.
+        scores: of the hypotheses it proposed.
+
+    """
+
+    factor: int
+    cell_m: float
+    scores: tuple[float, ...]
 
 
 class Pyramid:

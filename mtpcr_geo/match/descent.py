@@ -1,0 +1,105 @@
+"""Following hypotheses from the level that proposed them down to the finest cells.
+
+On each level yaw and shift are improved in small steps about where the level above had left them; the cells
+halve, and so do the steps in yaw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from mtpcr_geo.core.system import usable_cores
+from mtpcr_geo.match.pose import Pose, centre_of, pose_of
+from mtpcr_geo.match.pyramid import Pyramid
+from mtpcr_geo.match.search import score_nearby
+
+ESTIMATE_CELLS = 20_000.0
+"""Cells that tell which yaw and shift fit best on the way down to the finest level."""
+FIRST_YAW_STEP_DEG = 1.0
+FIRST_YAWS: tuple[int, ...] = (-2, -1, 0, 1, 2)
+"""Steps tried on the level that proposed a pose: the search over all yaws takes steps of up to 4 degrees."""
+WINDOW_CELLS = 2
+FEWEST_FOLLOWED = 4
+GROWTH_MARGIN = 1.25
+"""Times by which the score of a hypothesis may grow on its way down beyond the most that any was seen to."""
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Hypotheses at the finest cells.
+
+    Attributes:
+        poses: those followed down, with their scores there.
+        bound: those left above score less than this at the finest cells.
+
+    """
+
+    poses: tuple[Pose, ...]
+    bound: float = 0.0
+
+
+def follow(pyramid: Pyramid, factor: int, poses: Sequence[Pose], worth: float = 0.0) -> Descent:
+    """Follow poses down to the finest cells.
+
+    The score of a pose grows by about as much as that of others of its level, since finer cells are more
+    cells. Once a few were followed, those that even with `GROWTH_MARGIN` times the largest growth seen would
+    score less than ``worth`` are left where they are.
+
+    Args:
+        pyramid: both rasters.
+        factor: the level that proposed the poses.
+        poses: best first.
+        worth: score at the finest cells below which a pose need not be known; 0 to follow all.
+
+    """
+    found: list[Pose] = []
+    growth = 0.0
+    with ThreadPoolExecutor(usable_cores()) as threads:
+        for start in range(0, len(poses), FEWEST_FOLLOWED):
+            some = poses[start : start + FEWEST_FOLLOWED]
+            reach = GROWTH_MARGIN * growth * max(pose.score for pose in some)
+            if found and reach < worth:
+                return Descent(tuple(found), GROWTH_MARGIN * growth * max(p.score for p in poses[start:]))
+            fine = list(threads.map(lambda pose: _follow_one(pyramid, factor, pose), some))
+            growth = max(
+                growth, *(b.score / a.score for a, b in zip(some, fine, strict=True) if a.score > 0), 0.0
+            )
+            found += fine
+    return Descent(tuple(found))
+
+
+def _follow_one(pyramid: Pyramid, factor: int, pose: Pose) -> Pose:
+    """Follow one pose down; its score is minus infinity where it leaves the target."""
+    level, step, yaws = factor, FIRST_YAW_STEP_DEG, FIRST_YAWS
+    while True:
+        source, target = pyramid.at(level)
+        tries = {k: _nearby(pyramid, level, pose, k * step) for k in yaws}
+        best = max(tries, key=lambda k: tries[k].score)
+        # uphill beyond what was tried at first, where the best lies at its end
+        for _ in range(2):
+            on = best + (1 if best > 0 else -1)
+            if best == 0 or on in tries:
+                break
+            tries[on] = _nearby(pyramid, level, pose, on * step)
+            if tries[on].score <= tries[best].score:
+                break
+            best = on
+        pose = tries[best]
+        if level == 1:
+            return score_nearby(source, target, pose, 1)[0]
+        finer = max(1, level // 2)
+        # the centre of the raster moves a little between levels: same pose, other pivot
+        hypothesis = pose.hypothesis(centre_of(source.grid))
+        pose = pose_of(hypothesis, centre_of(pyramid.at(finer)[0].grid))
+        level, step, yaws = finer, step / 2, (-1, 0, 1)
+
+
+def _nearby(pyramid: Pyramid, level: int, pose: Pose, turn_deg: float) -> Pose:
+    """Return the best shift near a pose turned by some degrees."""
+    source, target = pyramid.at(level)
+    turned = Pose(pose.yaw + np.radians(turn_deg), pose.east, pose.north)
+    return score_nearby(source, target, turned, WINDOW_CELLS, ESTIMATE_CELLS)[0]

@@ -1,0 +1,149 @@
+"""Judging hypotheses at the finest cells: by patches that must agree with each other, and by the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Mask
+from mtpcr_geo.match.candidates import AGREE_TOLERANCES, RADIUS_TOLERANCES, Candidate, same_pose
+from mtpcr_geo.match.patches import PatchMatches, match_patches
+from mtpcr_geo.match.pose import Pose, centre_of, pose_of
+from mtpcr_geo.match.pyramid import Pyramid
+from mtpcr_geo.match.search import Layer, score_nearby
+from mtpcr_geo.match.terrain import GroundComparison, Terrain, compare_ground
+from mtpcr_geo.method.scales import Scales
+from mtpcr_geo.method.solve import iterative_svd, ransac_upright
+
+CLEAR_MARGIN = 4.0
+"""Times by which the best strength exceeds a hypothesis' score, which bounds its strength, where patches need
+not be asked: the margin could not fall below this."""
+MAX_RADIUS_CELLS = 10
+WIDE_PATCH_CELLS = 24
+"""Cells along a patch from which the first look at a hypothesis is taken at cells twice as large."""
+FAINT = 2.0
+"""Times by which the second, closer look at a hypothesis may find it stronger than the first."""
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Judges poses of one source over one target.
+
+    Attributes:
+        pyramid: both rasters.
+        ground: terrain of source and target.
+        scales: lengths of the judgement.
+        patch_m: edge of a patch, metres.
+        search_radius_m: how far a patch may lie from where a hypothesis puts it at the first look, metres.
+        trust_vertical: whether both verticals are known, so that the terrains may differ by a shift alone.
+        seed: of the sampling when patches vote.
+
+    """
+
+    pyramid: Pyramid
+    ground: tuple[Terrain, Terrain]
+    scales: Scales
+    patch_m: float
+    search_radius_m: float
+    trust_vertical: bool
+    seed: int
+
+    @property
+    def radius_cells(self) -> int:
+        """How far a patch may lie from where the pose puts it at the second look, cells."""
+        return max(1, round(RADIUS_TOLERANCES * self.scales.tolerance_m / self.scales.cell_m))
+
+    def judge(self, poses: Sequence[Pose], known: float) -> tuple[list[Candidate], float]:
+        """Judge poses, those of the highest score first.
+
+        A strength is at most the score. What cannot come within `CLEAR_MARGIN` of the best is left with the
+        score as its bound, unjudged.
+
+        Args:
+            poses: at the finest cells.
+            known: strength reached by any hypothesis so far.
+
+        Returns:
+            What was judged, and the highest score of what was not.
+
+        """
+        separate: list[Pose] = []
+        near = self.scales.same_pose_m / 4
+        for pose in sorted(poses, key=lambda pose: -pose.score):
+            if np.isfinite(pose.score) and not any(same_pose(pose, o, near, np.inf) for o in separate):
+                separate.append(pose)
+        judged: list[Candidate] = []
+        for pose in separate:
+            if pose.score * CLEAR_MARGIN < known:
+                return judged, pose.score
+            judged.append(self.judge_one(pose, known))
+            known = max(known, judged[-1].strength)
+        return judged, 0.0
+
+    def judge_one(self, pose: Pose, known: float = 0.0) -> Candidate:
+        """Match patches around a pose, let them correct it, and match again from there.
+
+        The first look is a wide one, at cells twice as large where patches still hold enough of them. Where
+        so few patches agree already there that the pose cannot come within `CLEAR_MARGIN` of the strength
+        ``known``, the second is not taken.
+        """
+        fine, cell = self.pyramid.at(1), self.scales.cell_m
+        factor = 2 if self.patch_m >= WIDE_PATCH_CELLS * cell else 1
+        radius = min(max(self.radius_cells, round(self.search_radius_m / cell)), MAX_RADIUS_CELLS)
+        patches, supporting = self._patches(factor, pose, max(1, round(radius / factor)))
+        first = Candidate(pose, patches, supporting, self._compare_ground(pose))
+        if FAINT * first.strength * CLEAR_MARGIN < known:
+            return first
+        corrected = _corrected(pose, patches, supporting, self.pyramid.at(factor), self._agree_m, fine[0])
+        rescored = score_nearby(*fine, corrected, 1)[0]
+        # patches that do not agree must not carry a good hypothesis away
+        if rescored.score >= pose.score:
+            pose = rescored
+        return Candidate(pose, *self._patches(1, pose, self.radius_cells), self._compare_ground(pose))
+
+    @property
+    def _agree_m(self) -> float:
+        return AGREE_TOLERANCES * self.scales.tolerance_m
+
+    def _patches(self, factor: int, pose: Pose, window: int) -> tuple[PatchMatches, Mask]:
+        """Match the patches of a level around a pose of the finest, and mark those that agree on one."""
+        source, target = self.pyramid.at(factor)
+        if factor > 1:
+            pose = pose_of(pose.hypothesis(centre_of(self.pyramid.source.grid)), centre_of(source.grid))
+        stride = max(4, round(self.patch_m / 2 / source.grid.cell))
+        found = match_patches(source, target, pose, window=window, stride=stride)
+        s, t = source.grid.to_metres(found.source_px), target.grid.to_metres(found.target_px)
+        return found, ransac_upright(s, t, self._agree_m, self.seed, 500)[1]
+
+    def _compare_ground(self, pose: Pose) -> GroundComparison:
+        hypothesis = pose.hypothesis(centre_of(self.pyramid.source.grid))
+        return compare_ground(*self.ground, hypothesis, plane=not self.trust_vertical)
+
+
+def _corrected(
+    pose: Pose,
+    patches: PatchMatches,
+    supporting: Mask,
+    layers: tuple[Layer, Layer],
+    agree_m: float,
+    finest: Layer,
+) -> Pose:
+    """Fit yaw and shift of the finest source raster to patches, starting from those that agree."""
+    if supporting.sum() < 4:
+        return pose
+    flat = np.zeros((len(patches), 1))
+    solution = iterative_svd(
+        np.hstack([layers[0].grid.to_metres(patches.source_px), flat]),
+        np.hstack([layers[1].grid.to_metres(patches.target_px), flat]),
+        start=supporting,
+        weight=patches.score**2,
+        floor=agree_m,
+        upright=True,
+    )
+    east, north = transforms.apply(solution.T, np.array([[*centre_of(finest.grid), 0.0]]))[0, :2]
+    return Pose(
+        transforms.yaw_of(solution.T[:3, :3]), float(east), float(north), pose.score, pose.overlap_cells
+    )
