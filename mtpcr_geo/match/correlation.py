@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Mask
@@ -24,6 +23,7 @@ from mtpcr_geo.match.base import margin_of
 from mtpcr_geo.match.candidates import AGREE_TOLERANCES, RADIUS_TOLERANCES, Candidate, Pool, same_pose
 from mtpcr_geo.match.patches import PatchMatches, match_patches
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
+from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.pyramid import Pyramid, search_factors
 from mtpcr_geo.match.search import GlobalSearch, Layer, distinct, score_nearby
 from mtpcr_geo.match.terrain import FEWEST_CELLS as FEWEST_GROUND_CELLS
@@ -81,27 +81,6 @@ class CorrelationSettings:
 DEFAULTS = CorrelationSettings()
 
 
-@dataclass(frozen=True)
-class Prior:
-    """What is known beforehand of the pose: the clouds' own georeference, say.
-
-    Attributes:
-        hypothesis: the pose as known.
-        radius_m: how far the source may lie from there.
-        yaw_range: how far it may be turned from there, radians.
-
-    """
-
-    hypothesis: Hypothesis
-    radius_m: float
-    yaw_range: float
-
-    def yaws(self, step: float) -> NDArray[np.float64]:
-        """Yaws to search, radians, at most ``step`` apart, the known one among them."""
-        count = 2 * max(1, int(np.ceil(self.yaw_range / step))) + 1
-        return self.hypothesis.yaw + np.linspace(-self.yaw_range, self.yaw_range, count)
-
-
 def match(
     source: Bev,
     target: Bev,
@@ -135,7 +114,7 @@ def match(
             f"sparse for cells of {source.grid.cell:g} m: give a finer --cell, or larger clouds"
         )
     mirrored = None
-    if settings.mirrored_null and prior is None:
+    if settings.mirrored_null:
         twin = _Search(
             mirror(source),
             target,
@@ -146,7 +125,8 @@ def match(
             search.pyramid,
             MIRRORED_HYPOTHESES,
         )
-        mirrored, _ = twin.explore(None, [level.factor for level in searched], pool.candidates[0].strength)
+        null = None if prior is None else prior.mirrored()
+        mirrored, _ = twin.explore(null, [level.factor for level in searched], pool.candidates[0].strength)
     best = pool.candidates[0]
     patches = best.patches
     assert patches is not None  # hypotheses in a pool are judged by patches
@@ -253,8 +233,9 @@ class _Search:
             found = self._propose(factor, prior)
             cell = self.pyramid.source.grid.cell * factor
             levels.append(Level(factor, cell, tuple(round(pose.score, 3) for pose in found)))
-            if not levels[1:] and prior is None:
-                found = [*found, *self._propose_by_terrain(factor)]
+            if not levels[1:]:
+                known_pose = None if prior is None else prior.pose(self.pyramid.at(factor)[0].grid)
+                found = [*found, *([known_pose] if known_pose else []), *self._propose_by_terrain(factor, prior)]
             now, left = self._judge([self._descend(factor, pose) for pose in found], known)
             judged, bound = [*judged, *now], max(bound, left)
             known = max([known, *(candidate.strength for candidate in judged)])
@@ -294,25 +275,40 @@ class _Search:
         step = self._yaw_step(source)
         count = round(2 * np.pi / step)
         yaws = np.arange(count) * (2 * np.pi / count)
-        search = GlobalSearch(source, target, fewest)
+        reached = target if prior is None else prior.layer(source.grid, target)
+        if reached is None:
+            return []
+        search = GlobalSearch(source, reached, fewest)
         if prior is not None:
-            known = pose_of(prior.hypothesis, centre_of(source.grid))
-            search.restrict(known.east, known.north, prior.radius_m)
             yaws = prior.yaws(step)
+            place = prior.place_of(source.grid)
+            if place is not None:
+                search.restrict(place, prior.radius_m)
         poses = search.run(yaws, PEAKS_A_YAW, 4, self.advance)
         return distinct(poses, self.keep, 2 * step, 5 * cell)
 
-    def _propose_by_terrain(self, factor: int) -> list[Pose]:
+    def _propose_by_terrain(self, factor: int, prior: Prior | None) -> list[Pose]:
         """Propose the poses under which the grounds have the same shape, about the centre of a level."""
         source, target = self.terrain_source, self.terrain_target
+        if prior is not None:
+            reached = prior.terrain(source.grid, target)
+            if reached is None:
+                return []
+            target = reached
         cell = source.grid.cell
         least = self.settings.min_overlap_m2
         least = self.scales.least_overlap_m2 if least is None else least
         step = COARSEST_YAW_STEP_DEG
         yaws = np.radians(np.arange(0.0, 360.0, step))
+        if prior is not None:
+            yaws = prior.yaws(float(np.radians(step)))
         if min(source.mask.sum(), target.mask.sum()) < 4 * FEWEST_GROUND_CELLS:
             return []
-        poses = TerrainSearch(source, target, max(least / cell**2, FEWEST_GROUND_CELLS)).run(yaws)
+        search = TerrainSearch(source, target, max(least / cell**2, FEWEST_GROUND_CELLS))
+        place = None if prior is None else prior.place_of(source.grid)
+        if prior is not None and place is not None:
+            search.restrict(place, prior.radius_m)
+        poses = search.run(yaws)
         found = distinct(poses, TERRAIN_HYPOTHESES, np.radians(2 * step), 3 * cell)
         grid = self.pyramid.at(factor)[0].grid
         return [place_on(pose, source, grid) for pose in found]
