@@ -63,7 +63,9 @@ class RegisterVerb(RegisterOptions):
         Shown(OUTPUT, ("--out", "-o")),
     ]
     no_prior: Annotated[
-        bool, Field(description="search everywhere, whatever --prior says (the default)"), Shown(PRIOR)
+        bool,
+        Field(description="search everywhere, whatever --prior, --near and --yaw say (the default)"),
+        Shown(PRIOR),
     ] = False
     dump_pipeline: Annotated[
         bool, Field(description="print the run as pipeline JSON, and do not run it"), Shown(OUTPUT)

@@ -18,7 +18,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Mask
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
-from mtpcr_geo.core.types import Bev, Hypothesis, Matches
+from mtpcr_geo.core.types import Bev, Matches
 from mtpcr_geo.match.base import margin_of
 from mtpcr_geo.match.candidates import AGREE_TOLERANCES, RADIUS_TOLERANCES, Candidate, Pool, same_pose
 from mtpcr_geo.match.patches import PatchMatches, match_patches
@@ -234,8 +234,9 @@ class _Search:
             cell = self.pyramid.source.grid.cell * factor
             levels.append(Level(factor, cell, tuple(round(pose.score, 3) for pose in found)))
             if not levels[1:]:
+                found += self._propose_by_terrain(factor, prior)
                 known_pose = None if prior is None else prior.pose(self.pyramid.at(factor)[0].grid)
-                found = [*found, *([known_pose] if known_pose else []), *self._propose_by_terrain(factor, prior)]
+                found += [] if known_pose is None else [known_pose]
             now, left = self._judge([self._descend(factor, pose) for pose in found], known)
             judged, bound = [*judged, *now], max(bound, left)
             known = max([known, *(candidate.strength for candidate in judged)])

@@ -61,7 +61,7 @@ class Prior:
         """Return the yaws to search, radians, at most ``step`` apart, the known one among them."""
         if self.yaw is None or self.yaw_range >= np.pi:
             count = max(1, round(2 * np.pi / step))
-            return (self.yaw or 0.0) + np.arange(count) * (2 * np.pi / count)
+            return np.asarray((self.yaw or 0.0) + np.arange(count) * (2 * np.pi / count), np.float64)
         count = 2 * max(1, int(np.ceil(self.yaw_range / step))) + 1
         return self.yaw + np.linspace(-self.yaw_range, self.yaw_range, count)
 
@@ -78,7 +78,7 @@ class Prior:
         return at
 
     def pose(self, grid: Grid) -> Pose | None:
-        """Return the known pose about the centre of a raster of the source; None if no whole pose is known."""
+        """Return the pose about the centre of a raster of the source; None if no whole pose is known."""
         at = self.place_of(grid)
         return None if at is None or self.yaw is None else Pose(self.yaw, *at(self.yaw))
 
@@ -121,4 +121,3 @@ class Prior:
             row1 - row0,
         )
         return grid, slice(row0, row1), slice(column0, column1)
-

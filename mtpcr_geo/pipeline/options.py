@@ -110,6 +110,8 @@ Models = Annotated[
     Shown(MATCHING),
 ]
 Seed = Annotated[int, Field(ge=0, description="seed of everything random"), Shown(MATCHING)]
+
+
 def _plain(value: Any) -> Any:
     """Return arrays as lists and paths as text, so that Python may give either."""
     if isinstance(value, Path):
@@ -137,8 +139,8 @@ PriorPose = Annotated[
     str | tuple[Row, Row, Row, Row],
     BeforeValidator(_pose),
     Field(
-        description="pose known beforehand, near which is searched: none; georef, where both clouds' CRSs put "
-        "the source; or a file with a 4x4 from coordinates of the source's file to the target's: a "
+        description="pose known beforehand, near which is searched: none; georef, where both clouds' CRSs "
+        "put the source; or a file with a 4x4 from coordinates of the source's file to the target's: a "
         "transform.json, JSON, or four rows of four numbers"
     ),
     Shown(PRIOR, ("--prior",), metavar="none|georef|FILE"),
@@ -187,8 +189,8 @@ YawTolerance = Annotated[
         gt=0,
         le=180,
         allow_inf_nan=False,
-        description="largest difference from --yaw or from the yaw of --prior, degrees; if not given 15, under "
-        "--prior 5",
+        description="largest difference from --yaw or from the yaw of --prior, degrees; if not given 15, "
+        "under --prior 5",
     ),
     Shown(PRIOR),
 ]
@@ -197,8 +199,8 @@ PriorSigma = Annotated[
     Field(
         gt=0,
         allow_inf_nan=False,
-        description="under --prior: standard deviation of the source's place, metres; --within is three times "
-        "that",
+        description="under --prior: standard deviation of the source's place, metres; --within is three "
+        "times that",
     ),
     Shown(PRIOR),
 ]
