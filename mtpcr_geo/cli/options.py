@@ -18,12 +18,15 @@ from mtpcr_geo.pipeline.options import (
     RUN,
     Local,
     Models,
+    Near,
+    NearCrs,
     Overwrite,
     RegisterOptions,
     Shown,
     SourceCrs,
     TargetCrs,
     Vertical,
+    Within,
 )
 
 AsJson = Annotated[
@@ -146,6 +149,9 @@ class CheckVerb(VerbOptions):
     target_crs: TargetCrs = None
     local: Local = False
     vertical: Vertical = "refuse"
+    near: Near = None
+    near_crs: NearCrs = None
+    within: Within = None
     as_json: AsJson = False
     quiet: Quiet = False
 

@@ -96,6 +96,11 @@ def check_reach(
     )
 
 
+def rim_of(xyz: Floats, middle: Floats) -> float:
+    """Return how far (n, 3) points reach from their middle in plan, metres."""
+    return float(np.sqrt(((xyz[:, :2] - middle[:2]) ** 2).sum(axis=1).max()))
+
+
 def distance_to_box(place: Floats, bounds: Floats) -> float:
     """Return how far a place lies outside a box in plan, metres; 0 inside."""
     gap = np.maximum(np.maximum(bounds[0] - place, place - bounds[1]), 0.0)

@@ -406,7 +406,7 @@ def first_problem(error: ValidationError, model: type[BaseModel], spelt: Callabl
 
 
 def _short(value: Any) -> str:
-    text = repr(value)
+    text = " ".join(repr(value).split())
     return text if len(text) <= 60 else text[:57] + "..."
 
 

@@ -14,7 +14,7 @@ from mtpcr_geo.core.prior import KnownPlace, PriorSource
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.crs.facts import same_place
-from mtpcr_geo.crs.near import check_reach, distance_to_box, place_in_work
+from mtpcr_geo.crs.near import check_reach, distance_to_box, place_in_work, rim_of
 from mtpcr_geo.pipeline.options import PriorOptions
 from mtpcr_geo.pipeline.stages.pairs import georeference
 
@@ -52,7 +52,7 @@ def known_place(options: PriorOptions, pair: Pair, label: str) -> KnownPlace | N
     link = pair.target.link
     place = place_in_work(options.near, options.near_crs, link)
     place[2] = _height_at(place, pair.target.sample)
-    rim = _rim(pair, middle)
+    rim = rim_of(pair.source.sample, middle)
     within = rim if options.within_m is None else options.within_m
     check_reach(place, within, rim, _bounds(pair), options.near, link, options.near_crs is not None)
     return KnownPlace("near", middle, place, within, yaw, yaw_within)
@@ -108,7 +108,7 @@ def _posed(options: PriorOptions, pair: Pair, label: str, middle: Floats) -> Kno
         hint = "see that it takes coordinates of the source's file to those of the target's"
         T = _T_of(options, pair, name, middle)
     place = transforms.apply(T, middle[None])[0]
-    within, rim = options.within_m, _rim(pair, middle)
+    within, rim = options.within_m, rim_of(pair.source.sample, middle)
     assert within is not None
     gap = distance_to_box(place, _bounds(pair))
     if gap > within + rim:
@@ -230,12 +230,6 @@ def _height_at(place: Floats, target: Floats) -> float:
     squared = (target[:, 0] - place[0]) ** 2 + (target[:, 1] - place[1]) ** 2
     count = min(HEIGHT_POINTS, len(target))
     return float(np.median(target[np.argpartition(squared, count - 1)[:count], 2]))
-
-
-def _rim(pair: Pair, middle: Floats) -> float:
-    """Return how far the source reaches from its middle in plan, metres."""
-    x, y = (pair.source.sample[:, :2] - middle[:2]).T
-    return float(np.sqrt((x**2 + y**2).max()))
 
 
 def _bounds(pair: Pair) -> Floats:
