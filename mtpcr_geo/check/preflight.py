@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from mtpcr_geo.check import header, pair, place, points
 from mtpcr_geo.check.describe import CloudFacts, describe
 from mtpcr_geo.check.findings import CloudRole, Finding, Role, by_severity, finding_of
@@ -15,6 +17,7 @@ from mtpcr_geo.check.inspection import Inspection
 from mtpcr_geo.core.errors import CrsError, InputError, MtpcrError, OptionError, RegistrationError
 from mtpcr_geo.core.frames import box_points
 from mtpcr_geo.crs import FrameLink, WorkFrame, resolve_frames
+from mtpcr_geo.crs.near import check_reach, distance_to_box, place_in_work, rim_of
 from mtpcr_geo.io.las import check_distinct, open_cloud
 from mtpcr_geo.io.sample import Scan, scan
 from mtpcr_geo.method.bev import choose_cell, coverage_of, grid_around
@@ -75,6 +78,9 @@ def check_clouds(
     target_crs: str | None = None,
     local: bool = False,
     vertical: Vertical = "refuse",
+    near: tuple[float, float] | None = None,
+    near_crs: str | None = None,
+    within: float | None = None,
     progress: Progress | None = None,
 ) -> CheckReport:
     """Read one or two clouds as `register` would; report what is wrong with them, and how to mend it.
@@ -89,6 +95,9 @@ def check_clouds(
         target_crs: CRS of the target, likewise.
         local: both clouds are local, in metres.
         vertical: what to do with different vertical datums.
+        near: place near which the middle of the source lies, in the target's CRS.
+        near_crs: CRS of that place, if not the target's.
+        within: how far from there it may lie, metres; if None as far as the source reaches from its middle.
         progress: where to report the points read.
 
     Raises:
@@ -97,6 +106,10 @@ def check_clouds(
     """
     if target is None and source_crs is not None and target_crs is not None:
         raise OptionError("--target-crs is of no use with one cloud; give --source-crs, or a second cloud")
+    if near is None and (near_crs is not None or within is not None):
+        raise OptionError("--near-crs and --within are of use with --near only; give --near X Y")
+    if near is not None and target is None:
+        raise OptionError("--near is a place in the target, and there is one cloud; give a second one")
     check = _Check()
     files: list[tuple[CloudRole, str | Path, str | None]]
     files = [("source", source, source_crs if target is not None else source_crs or target_crs)]
@@ -113,7 +126,9 @@ def check_clouds(
     for inspection in check.inspections.values():
         check.inspect(inspection, declared[inspection.role], local, one=target is None, progress=progress)
     if target is not None and len(check.inspections) == 2:
-        check.compare(declared, local, vertical)
+        frames = check.compare(declared, local, vertical)
+        if near is not None and frames is not None:
+            check.place(near, near_crs, within, frames)
     else:
         check.alone(declared, local)
     check.rasters()
@@ -203,8 +218,10 @@ class _Check:
                     local=local,
                 )
 
-    def compare(self, declared: dict[CloudRole, str | None], local: bool, vertical: Vertical) -> None:
-        """Settle the common frame of both clouds, and compare them in it."""
+    def compare(
+        self, declared: dict[CloudRole, str | None], local: bool, vertical: Vertical
+    ) -> Frames | None:
+        """Settle the common frame of both clouds, and compare them in it; None where there is none."""
         source, target = self.inspections["source"], self.inspections["target"]
         self.relation = pair.Relation("unknown")
         try:
@@ -221,6 +238,35 @@ class _Check:
         if self.relation.name != "overlapping":
             self.findings += pair.swapped_findings(source, target)
         self.findings += pair.same_points_findings(source, target)
+        return frames
+
+    def place(
+        self, near: tuple[float, float], near_crs: str | None, within: float | None, frames: Frames
+    ) -> None:
+        """Note a refusal where the source cannot reach the target from the place given."""
+        _, to_target, to_source = frames
+        source, target = (self.inspections[role].scan for role in ("source", "target"))
+        if source is None or target is None:
+            return
+        with self.stopping("near", "both"):
+            place = place_in_work(near, near_crs, to_target)
+            sample, bounds = to_source.to_work(source.sample), to_target.to_work(target.sample)
+            rim = rim_of(sample, sample.mean(axis=0))
+            radius = rim if within is None else within
+            box = np.stack([bounds.min(axis=0), bounds.max(axis=0)])
+            check_reach(place, radius, rim, box, near, to_target, near_crs is not None)
+            gap = distance_to_box(place, box)
+            if gap > radius:
+                self.findings.append(
+                    Finding(
+                        "warning",
+                        "near",
+                        "both",
+                        f"the middle of the source lies {gap - radius:.0f} m outside the target at least, by "
+                        "--near and --within",
+                        "check the place; parts of the source can overlap at most",
+                    )
+                )
 
     def _relate(self, frames: Frames, source: Inspection, target: Inspection) -> None:
         frame, to_target, to_source = frames

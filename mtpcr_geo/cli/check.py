@@ -17,6 +17,7 @@ def run(options: CheckVerb) -> None:
     Examples:
         mtpcr-geo check ground.laz aerial.laz
         mtpcr-geo check scan.laz --json
+        mtpcr-geo check scan.laz tile.laz --source-crs local --near 85000 446600 --within 50
 
     """
     from mtpcr_geo.check import check_clouds
@@ -30,6 +31,9 @@ def run(options: CheckVerb) -> None:
             target_crs=options.target_crs,
             local=options.local,
             vertical=options.vertical,
+            near=options.near,
+            near_crs=options.near_crs,
+            within=options.within,
             progress=progress,
         )
     show(report, as_json=options.as_json, quiet=options.quiet)

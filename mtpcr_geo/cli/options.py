@@ -18,12 +18,15 @@ from mtpcr_geo.pipeline.options import (
     RUN,
     Local,
     Models,
+    Near,
+    NearCrs,
     Overwrite,
     RegisterOptions,
     Shown,
     SourceCrs,
     TargetCrs,
     Vertical,
+    Within,
 )
 
 AsJson = Annotated[
@@ -63,7 +66,9 @@ class RegisterVerb(RegisterOptions):
         Shown(OUTPUT, ("--out", "-o")),
     ]
     no_prior: Annotated[
-        bool, Field(description="search everywhere, whatever --prior says (the default)"), Shown(PRIOR)
+        bool,
+        Field(description="search everywhere, whatever --prior, --near and --yaw say (the default)"),
+        Shown(PRIOR),
     ] = False
     dump_pipeline: Annotated[
         bool, Field(description="print the run as pipeline JSON, and do not run it"), Shown(OUTPUT)
@@ -144,6 +149,9 @@ class CheckVerb(VerbOptions):
     target_crs: TargetCrs = None
     local: Local = False
     vertical: Vertical = "refuse"
+    near: Near = None
+    near_crs: NearCrs = None
+    within: Within = None
     as_json: AsJson = False
     quiet: Quiet = False
 

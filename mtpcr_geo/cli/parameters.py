@@ -117,8 +117,13 @@ def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
     if field.annotation is bool:
         default = False
     else:
-        declaration["metavar"] = name.upper() if shown.argument else _metavar(field.annotation)
-        kind = Path if Path in (field.annotation, *get_args(field.annotation)) else str
+        named = name.upper() if shown.argument else shown.metavar
+        declaration["metavar"] = named or _metavar(field.annotation)
+        choices = (field.annotation, *get_args(field.annotation))
+        several = next((one for one in choices if get_origin(one) is tuple), None)
+        kind = Path if Path in choices else str
+        if several is not None and str not in choices:
+            kind = tuple[(str,) * len(get_args(several))]  # type: ignore[misc]
     info: Any
     if shown.argument:
         info = typer.Argument(default, **declaration)

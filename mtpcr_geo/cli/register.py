@@ -7,7 +7,7 @@ import typer
 from mtpcr_geo.cli.options import RegisterVerb
 from mtpcr_geo.cli.parameters import command_of
 from mtpcr_geo.cli.shared import end_with, progress_bars
-from mtpcr_geo.pipeline.options import RegisterOptions
+from mtpcr_geo.pipeline.options import PriorOptions, RegisterOptions
 
 
 def run(options: RegisterVerb) -> None:
@@ -19,6 +19,7 @@ def run(options: RegisterVerb) -> None:
     Examples:
         mtpcr-geo register ground.laz aerial.laz -o out
         mtpcr-geo register scan.laz tile.laz -o out --source-crs local --overwrite
+        mtpcr-geo register scan.laz tile.laz -o out --source-crs local --near 4.895 52.37 --near-crs EPSG:4326
         mtpcr-geo register ground.laz aerial.laz -o out --dump-pipeline > mine.json
 
     """
@@ -28,7 +29,7 @@ def run(options: RegisterVerb) -> None:
 
     given = {name: getattr(options, name) for name in RegisterOptions.model_fields}
     if options.no_prior:
-        given["prior"] = "none"
+        given |= PriorOptions().model_dump()
     if options.dump_pipeline:
         typer.echo(dump(build_pipeline(options.source, options.target, options.out, read_options(given))))
         return

@@ -22,6 +22,7 @@ from mtpcr_geo.core.fits import Refinement as Refinement
 from mtpcr_geo.core.fits import Solution as Solution
 from mtpcr_geo.core.fits import SolveSettings as SolveSettings
 from mtpcr_geo.core.grid import Grid
+from mtpcr_geo.core.prior import KnownPlace as KnownPlace
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.frames import FrameLink, WorkFrame
@@ -252,7 +253,7 @@ class Pair(ComparesArrays):
         T_target_source: 4x4 in work coordinates (source work -> target work), once solved.
         solution: how it was solved.
         refinement: how it was refined.
-        T_prior: 4x4 in work coordinates that was known beforehand, where a prior was asked for.
+        known: what was known beforehand of the source's place and yaw, where a prior was given.
         verdict: the judgement, once made.
 
     """
@@ -265,7 +266,7 @@ class Pair(ComparesArrays):
     T_target_source: Floats | None = None
     solution: Solution | None = None
     refinement: Refinement | None = None
-    T_prior: Floats | None = None
+    known: KnownPlace | None = None
     verdict: Verdict | None = None
 
     @property
@@ -273,6 +274,11 @@ class Pair(ComparesArrays):
         """The larger cell of both rasters, metres: how exact matches can be; 1 where there is none."""
         cells = [side.bev.grid.cell for side in (self.source, self.target) if side.bev is not None]
         return max(cells, default=1.0)
+
+    @property
+    def T_prior(self) -> Floats | None:
+        """4x4 in work coordinates that was known beforehand; None where no whole pose was."""
+        return None if self.known is None else self.known.T
 
     @property
     def T_level_target_source(self) -> Floats:

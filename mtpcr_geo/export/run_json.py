@@ -55,7 +55,7 @@ The metrics:
   unknown
 - ``metrics.patch_support``: share of the patches in the overlap that agree on the pose; null from keypoints
 - ``metrics.null_ratio``: how many times stronger the pose is than the best of the mirrored source, which has
-  no right pose; null from keypoints and with a prior
+  no right pose; null from keypoints
 - ``metrics.overlap_m2``: ground that both clouds see
 - ``metrics.overlap_source``: the same as a share of the source's ground, 0 to 1
 - ``metrics.overlap_target``: the same as a share of the target's ground, 0 to 1
@@ -66,6 +66,8 @@ The metrics:
 - ``metrics.yaw_deg``: yaw of the transform in the work frame, counter-clockwise from above
 - ``metrics.tilt_deg``: angle by which it tilts the vertical
 - ``metrics.shift_work_m``: its translation between work coordinates
+- ``metrics.prior_distance_m``: how far the middle of the source lies from where --near or --prior puts it
+- ``metrics.prior_yaw_difference_deg``: how far the yaw is from that of --yaw or --prior
 - ``metrics.tie_points``: all tie points
 - ``metrics.tie_points_agreeing``: of these, tie points that agree with the final transform
 - ``metrics.sigma_yaw_deg``: standard deviation of the yaw, from the tie points
@@ -107,6 +109,12 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.enhance <role>.mean_grey``: mean of the image that is matched, 0 to 255
 - ``mtpcr.enhance <role>.saturated_share``: share of its pixels that are 0 or 255
 - ``mtpcr.match matches``: matches found
+- ``mtpcr.match prior.given_by``: what the search was narrowed by: georef, file, matrix, near or yaw
+- ``mtpcr.match prior.middle_of_source``: mean of the source's points, in its file's coordinates
+- ``mtpcr.match prior.place``: where that lies by the prior, in the target's file's coordinates
+- ``mtpcr.match prior.within_m``: how far from there it may lie
+- ``mtpcr.match prior.yaw_deg``: yaw by the prior, between work coordinates
+- ``mtpcr.match prior.yaw_tolerance_deg``: how far from that it may be
 - ``mtpcr.match method``: name of a keypoint matcher
 - ``mtpcr.match cell_m``: cell of the last search; from keypoints, those of both rasters
 - ``mtpcr.match extent_m``: edge of a square of the smaller cloud's occupied area, from which lengths follow
@@ -188,6 +196,8 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.assess tie_points_and_ground_agreeing``: with a prior: tie points and cells of ground that agree
   with the result
 - ``mtpcr.assess with_prior``: the same for the prior
+- ``mtpcr.assess surface_residual``: how badly flat surfaces meet under the result and under the prior: 0 all
+  meet, 1 none does; null where there are too few
 - ``mtpcr.assess prior_kept``: whether the prior was kept
 - ``mtpcr.apply skipped``: why no cloud was made, where none was
 - ``mtpcr.write_<what> skipped``: why nothing was written, where nothing was

@@ -13,16 +13,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
-from mtpcr_geo.core.types import Bev, Hypothesis, Matches
+from mtpcr_geo.core.types import Bev, Matches
 from mtpcr_geo.match.base import margin_of
 from mtpcr_geo.match.candidates import Candidate, Pool
 from mtpcr_geo.match.descent import follow
 from mtpcr_geo.match.judge import CLEAR_MARGIN, Judge
-from mtpcr_geo.match.pose import Pose, centre_of, pose_of
+from mtpcr_geo.match.pose import Pose, centre_of
+from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.pyramid import Level, Pyramid, search_factors
 from mtpcr_geo.match.search import GlobalSearch, Layer, distinct
 from mtpcr_geo.match.terrain import FEWEST_CELLS as FEWEST_GROUND_CELLS
@@ -32,11 +32,13 @@ from mtpcr_geo.method.scales import Scales, scales_of
 COARSEST_YAW_STEP_DEG, FINEST_YAW_STEP_DEG = 4.0, 2.0
 FEWEST_OVERLAP_CELLS = 20
 PEAKS_A_YAW = 3
-HYPOTHESES = 10
-TERRAIN_HYPOTHESES = 6
+HYPOTHESES, MORE_HYPOTHESES = 10, 48
+"""Hypotheses of a level followed at first, and at most where these do not convince: a small source has more
+places to lie in a large target, and each costs less to follow."""
+TERRAIN_HYPOTHESES, MORE_TERRAIN_HYPOTHESES = 6, 24
 MIRRORED_HYPOTHESES = 24
-"""Hypotheses kept of a level of the mirrored search: where a scene repeats itself many score alike, and the
-best of them must be met."""
+"""Hypotheses of a level of the mirrored search followed at first: where a scene repeats itself many score
+alike, and the best of them must be met."""
 SMALL_SITE_NEG_LOG10_P, SMALL_SITE_MARGIN, SMALL_SITE_SUPPORT = 8.0, 3.0, 0.5
 """What convinces where there are too few patches for `CorrelationSettings.convincing_neg_log10_p`."""
 PROMISING_NEG_LOG10_P, CONVINCING_NULL_RATIO = 4.0, 2.0
@@ -76,27 +78,6 @@ class CorrelationSettings:
 DEFAULTS = CorrelationSettings()
 
 
-@dataclass(frozen=True)
-class Prior:
-    """What is known beforehand of the pose: the clouds' own georeference, say.
-
-    Attributes:
-        hypothesis: the pose as known.
-        radius_m: how far the source may lie from there.
-        yaw_range: how far it may be turned from there, radians.
-
-    """
-
-    hypothesis: Hypothesis
-    radius_m: float
-    yaw_range: float
-
-    def yaws(self, step: float) -> NDArray[np.float64]:
-        """Yaws to search, radians, at most ``step`` apart, the known one among them."""
-        count = 2 * max(1, int(np.ceil(self.yaw_range / step))) + 1
-        return self.hypothesis.yaw + np.linspace(-self.yaw_range, self.yaw_range, count)
-
-
 def match(
     source: Bev,
     target: Bev,
@@ -122,14 +103,16 @@ def match(
 
     """
     scales = scales_of(source, target)
-    search = _Search(source, target, scales, settings, seed, advance)
+    search = _Search(source, target, scales, settings, seed, advance, prior)
     twin = None
-    if settings.mirrored_null and prior is None:
+    if settings.mirrored_null:
+        null = None if prior is None else prior.mirrored()
         twin = _Search(
-            mirror(source), target, scales, settings, seed, advance, search.pyramid, MIRRORED_HYPOTHESES
+            mirror(source), target, scales, settings, seed, advance, null, search.pyramid, MIRRORED_HYPOTHESES
         )
-    for factor in search_factors(source, target):
-        search.explore(factor, prior)
+    for factor, part in ((factor, part) for factor in search_factors(source, target) for part in (0, 1)):
+        if not search.explore(factor, part) and part:
+            continue
         if search.convinces():
             break
         if twin is not None and search.promises():
@@ -198,7 +181,7 @@ def mirror(bev: Bev) -> Bev:
 
 
 class _Search:
-    """Explores the levels of one source against one target."""
+    """Explores the levels of one source against one target, part by part."""
 
     def __init__(
         self,
@@ -208,12 +191,12 @@ class _Search:
         settings: CorrelationSettings,
         seed: int,
         advance: Callable[[int], object],
+        prior: Prior | None = None,
         shared: Pyramid | None = None,
-        keep: int = HYPOTHESES,
+        first: int = HYPOTHESES,
     ) -> None:
         self.pyramid = Pyramid(source, target, shared)
-        self.scales, self.settings, self.seed, self.advance = scales, settings, seed, advance
-        self.keep = keep
+        self.scales, self.settings, self.advance, self.prior = scales, settings, advance, prior
         self.terrain = (Terrain.of(source, scales.terrain_cell_m), Terrain.of(target, scales.terrain_cell_m))
         self.judge = Judge(
             self.pyramid,
@@ -226,39 +209,60 @@ class _Search:
             trust_vertical=settings.trust_vertical,
             seed=seed,
         )
+        room = target.grid.width * target.grid.height / max(source.grid.width * source.grid.height, 1)
+        self.first = first
+        self.most = int(np.clip(HYPOTHESES * room, first, MORE_HYPOTHESES))
         self.levels: list[Level] = []
+        self.done: list[tuple[int, int]] = []
         self.judged: list[Candidate] = []
         self.pool = Pool()
+        self._proposed: dict[int, tuple[list[Pose], list[Pose]]] = {}
 
-    def explore(self, factor: int, prior: Prior | None, known: float = 0.0) -> None:
-        """Search one more level.
+    def explore(self, factor: int, part: int, known: float = 0.0) -> bool:
+        """Propose at a level, and follow and judge the first or the second part of what was proposed.
 
         Args:
-            factor: its cell as a multiple of the finest.
-            prior: what is known of the pose.
+            factor: the level's cell as a multiple of the finest.
+            part: 0 for the best hypotheses, 1 for the others.
             known: strength that matters; what cannot come within `CLEAR_MARGIN` of it is not followed.
 
+        Returns:
+            Whether there were any.
+
         """
-        proposed = self._propose(factor, prior)
-        by_terrain = self._propose_by_terrain(factor) if not self.levels and prior is None else []
-        cell = self.pyramid.source.grid.cell * factor
-        self.levels.append(Level(factor, cell, tuple(round(pose.score, 3) for pose in proposed)))
+        if factor not in self._proposed:
+            self._proposed[factor] = self._propose(factor), self._propose_by_terrain(factor)
+            cell = self.pyramid.source.grid.cell * factor
+            scores = tuple(round(pose.score, 3) for pose in self._proposed[factor][0])
+            self.levels.append(Level(factor, cell, scores))
+        self.done.append((factor, part))
+        by_channels, by_terrain = self._proposed[factor]
+        cuts = self.first, TERRAIN_HYPOTHESES
+        if part:
+            by_channels, by_terrain = by_channels[cuts[0] :], by_terrain[cuts[1] :]
+        else:
+            by_channels, by_terrain = by_channels[: cuts[0]], by_terrain[: cuts[1]]
+            if self.prior is not None and len(self.levels) == 1:
+                pose = self.prior.pose(self.pyramid.at(factor)[0].grid)
+                by_terrain = by_terrain if pose is None else [*by_terrain, pose]
+        if not by_channels and not by_terrain:
+            return False
         followed = [
-            follow(self.pyramid, factor, proposed, known / CLEAR_MARGIN),
+            follow(self.pyramid, factor, by_channels, known / CLEAR_MARGIN),
             follow(self.pyramid, factor, by_terrain),
         ]
         known = max([known, *(candidate.strength for candidate in self.judged)])
-        poses = [pose for descent in followed for pose in descent.poses]
-        now, left = self.judge.judge(poses, known)
+        now, left = self.judge.judge([pose for descent in followed for pose in descent.poses], known)
         self.judged += now
         bound = max(self.pool.bound, left, *(descent.bound for descent in followed))
         self.pool = Pool.of(self.judged, self.scales, bound)
+        return True
 
     def catch_up(self, other: _Search) -> None:
-        """Search the levels that another has searched, as far as they matter beside what it found."""
+        """Search what another has searched, as far as it matters beside what that found."""
         known = other.pool.candidates[0].strength if other.pool.candidates else 0.0
-        for level in other.levels[len(self.levels) :]:
-            self.explore(level.factor, None, known)
+        for factor, part in other.done[len(self.done) :]:
+            self.explore(factor, part, known)
 
     def over(self, other: _Search) -> float:
         """Return the strength of the best over the greatest of another search, at least."""
@@ -295,35 +299,52 @@ class _Search:
         step = np.degrees(1.5 / max(rim, 1.0))
         return float(np.radians(np.clip(step, FINEST_YAW_STEP_DEG, COARSEST_YAW_STEP_DEG)))
 
-    def _propose(self, factor: int, prior: Prior | None) -> list[Pose]:
+    def _propose(self, factor: int) -> list[Pose]:
+        """Propose the poses under which both channels agree best at a level."""
         source, target = self.pyramid.at(factor)
-        cell = source.grid.cell
+        cell, prior = source.grid.cell, self.prior
         smaller = min(float(layer.channels.mask.sum()) for layer in (source, target))
-        least = self.settings.min_overlap_m2
-        least = self.scales.least_overlap_m2 if least is None else least
-        fewest = max(least / cell**2, self.settings.min_overlap_share * smaller, FEWEST_OVERLAP_CELLS)
+        fewest = max(
+            self._least_m2 / cell**2, self.settings.min_overlap_share * smaller, FEWEST_OVERLAP_CELLS
+        )
         step = self._yaw_step(source)
         count = round(2 * np.pi / step)
         yaws = np.arange(count) * (2 * np.pi / count)
-        search = GlobalSearch(source, target, fewest)
+        reached = target if prior is None else prior.layer(source.grid, target)
+        if reached is None:
+            return []
+        search = GlobalSearch(source, reached, fewest)
         if prior is not None:
-            known = pose_of(prior.hypothesis, centre_of(source.grid))
-            search.restrict(known.east, known.north, prior.radius_m)
             yaws = prior.yaws(step)
+            place = prior.place_of(source.grid)
+            if place is not None:
+                search.restrict(place, prior.radius_m)
         poses = search.run(yaws, PEAKS_A_YAW, 4, self.advance)
-        return distinct(poses, self.keep, 2 * step, 5 * cell)
+        return distinct(poses, self.most, 2 * step, 5 * cell)
 
     def _propose_by_terrain(self, factor: int) -> list[Pose]:
-        """Propose the poses under which the grounds have the same shape, about the centre of a level."""
+        """Propose, for the first level, the poses under which the grounds have the same shape."""
         source, target = self.terrain
-        cell = source.grid.cell
-        least = self.settings.min_overlap_m2
-        least = self.scales.least_overlap_m2 if least is None else least
-        step = COARSEST_YAW_STEP_DEG
-        yaws = np.radians(np.arange(0.0, 360.0, step))
-        if min(source.mask.sum(), target.mask.sum()) < 4 * FEWEST_GROUND_CELLS:
+        cell, prior = source.grid.cell, self.prior
+        reached = target if prior is None else prior.terrain(source.grid, target)
+        if self._proposed or reached is None:
             return []
-        poses = TerrainSearch(source, target, max(least / cell**2, FEWEST_GROUND_CELLS)).run(yaws)
-        found = distinct(poses, TERRAIN_HYPOTHESES, np.radians(2 * step), 3 * cell)
+        if min(source.mask.sum(), reached.mask.sum()) < 4 * FEWEST_GROUND_CELLS:
+            return []
+        step = np.radians(COARSEST_YAW_STEP_DEG)
+        yaws = np.arange(0.0, 2 * np.pi - step / 2, step)
+        search = TerrainSearch(source, reached, max(self._least_m2 / cell**2, FEWEST_GROUND_CELLS))
+        if prior is not None:
+            yaws = prior.yaws(step)
+            place = prior.place_of(source.grid)
+            if place is not None:
+                search.restrict(place, prior.radius_m)
+        more = TERRAIN_HYPOTHESES if self.most == self.first else MORE_TERRAIN_HYPOTHESES
+        found = distinct(search.run(yaws), more, 2 * step, 3 * cell)
         grid = self.pyramid.at(factor)[0].grid
         return [place_on(pose, source, grid) for pose in found]
+
+    @property
+    def _least_m2(self) -> float:
+        given = self.settings.min_overlap_m2
+        return self.scales.least_overlap_m2 if given is None else given

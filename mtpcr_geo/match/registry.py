@@ -9,10 +9,11 @@ from typing import Any, Literal
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.types import Matches
 from mtpcr_geo.match.base import Advance, ImageMatcher, Matcher, View
-from mtpcr_geo.match.correlation import CorrelationSettings, Prior
+from mtpcr_geo.match.correlation import CorrelationSettings
 from mtpcr_geo.match.descriptors import Extractor, FeatureMatcher, NearestNeighbours, Orb, RootSift
 from mtpcr_geo.match.keypoints import KeypointMatcher
 from mtpcr_geo.match.learned.model_cards import ModelDescription, descriptions, models_folder, path_of
+from mtpcr_geo.match.prior import Prior
 
 BUILT_IN = ("correlation", "rootsift", "orb")
 RATIO = 0.9
@@ -51,7 +52,7 @@ class CorrelationMatcher:
 
     Attributes:
         settings: what governs the search.
-        prior: a pose known beforehand.
+        prior: what is known of the pose beforehand.
 
     """
 

@@ -86,17 +86,28 @@ class GlobalSearch:
         height, width = target.grid.shape
         self._shape = tuple(cv2.getOptimalDFTSize(n + side - 1) for n in (height, width))
         self._target_spectra = self._spectra(target.channels.stack)
-        self._allowed: NDArray[np.bool_] | None = None
+        self._allowed: Callable[[float], NDArray[np.bool_]] | None = None
 
-    def restrict(self, east: float, north: float, radius: float) -> None:
-        """Consider only poses that put the source raster's centre within ``radius`` metres of a place."""
+    def restrict(self, place: Callable[[float], tuple[float, float]], radius: float) -> None:
+        """Consider only poses that put the source raster's centre near a place, which may depend on the yaw.
+
+        Args:
+            place: gives east and north of it for a yaw, metres.
+            radius: how far from it, metres; a cell is added, by which poses lie apart.
+
+        """
         rows, columns = (np.arange(n) for n in self._shape)
         height, width = self.target.grid.shape
         dy = np.where(rows < height, rows, rows - self._shape[0])
         dx = np.where(columns < width, columns, columns - self._shape[1])
         x, y = self._place(dx, dy)
-        reach = max(radius, self.target.grid.cell)
-        self._allowed = np.hypot(x[None, :] - east, y[:, None] - north) <= reach
+        reach = radius + self.target.grid.cell
+
+        def allowed(yaw: float) -> NDArray[np.bool_]:
+            east, north = place(yaw)
+            return np.asarray((x[None, :] - east) ** 2 + (y[:, None] - north) ** 2 <= reach**2)
+
+        self._allowed = allowed
 
     def _place(self, dx: Any, dy: Any) -> tuple[Any, Any]:
         """Where a shift of the turned raster by (dx, dy) cells puts its centre, metres."""
@@ -135,7 +146,7 @@ class GlobalSearch:
         score = correlation_score(overlap, (pa, pe), (sa, se), (ta, te))
         considered = overlap >= self.min_overlap
         if self._allowed is not None:
-            considered &= self._allowed
+            considered &= self._allowed(yaw)
         return np.where(considered, score, -np.inf), overlap
 
     def peaks(self, yaw: float, count: int, apart_cells: int) -> list[Pose]:

@@ -7,7 +7,7 @@ plane where a vertical is not trusted: as a search of its own that proposes pose
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -132,6 +132,17 @@ class TerrainSearch:
         height, width = target.grid.shape
         self._shape = tuple(cv2.getOptimalDFTSize(n + self._side - 1) for n in (height, width))
         self._target = [self._spectrum(one) for one in (target.mask, target.low, target.low**2)]
+        self._near: tuple[Callable[[float], tuple[float, float]], float] | None = None
+
+    def restrict(self, place: Callable[[float], tuple[float, float]], radius: float) -> None:
+        """Consider only poses that put the source terrain's centre near a place, see `GlobalSearch.restrict`.
+
+        Args:
+            place: gives east and north of it for a yaw, metres.
+            radius: how far from it, metres; a cell is added, by which poses lie apart.
+
+        """
+        self._near = place, radius + self.target.grid.cell
 
     def _spectrum(self, image: Image) -> Image:
         padded = np.zeros(self._shape, np.float32)
@@ -161,13 +172,18 @@ class TerrainSearch:
         both = cross / cells - mean_s * mean_t
         rest = np.maximum(var_s + var_t - 2 * both, 2 * NOISE_M**2)
         score = np.where(n >= self.min_cells, cells / 2 * np.log((var_s + var_t) / rest), -np.inf)
+        dy, dx = np.arange(self._shape[0])[:, None], np.arange(self._shape[1])[None, :]
+        dy = np.where(dy < grid.height, dy, dy - self._shape[0])
+        dx = np.where(dx < grid.width, dx, dx - self._shape[1])
+        x = grid.west + (dx + self._side / 2) * grid.cell
+        y = grid.north - (dy + self._side / 2) * grid.cell
+        if self._near is not None:
+            (near_x, near_y), reach = self._near[0](yaw), self._near[1]
+            score = np.where((x - near_x) ** 2 + (y - near_y) ** 2 <= reach**2, score, -np.inf)
         row, column = np.unravel_index(int(np.argmax(score)), score.shape)
         if not np.isfinite(score[row, column]):
             return None
-        dy = row if row < grid.height else row - self._shape[0]
-        dx = column if column < grid.width else column - self._shape[1]
-        east = grid.west + (dx + self._side / 2) * grid.cell
-        north = grid.north - (dy + self._side / 2) * grid.cell
+        east, north = x[0, column], y[row, 0]
         return Pose(yaw, float(east), float(north), float(score[row, column]), round(float(n[row, column])))
 
     def run(self, yaws: Iterable[float]) -> list[Pose]:

@@ -8,12 +8,14 @@ default is given by each model, and tests hold them equal.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic.fields import FieldInfo
 
 from mtpcr_geo.core.suggestions import meant
@@ -38,12 +40,14 @@ class Shown:
         names: what is written on the command line; ``--name-of-the-field`` if empty, and for a switch that
             is on by default ``--no-name-of-the-field``, so that its description follows "do not".
         argument: it is given by its place, without a name.
+        metavar: what stands for its value, where its type does not say enough.
 
     """
 
     group: str
     names: tuple[str, ...] = ()
     argument: bool = False
+    metavar: str = ""
 
 
 SourceCrs = Annotated[
@@ -106,33 +110,197 @@ Models = Annotated[
     Shown(MATCHING),
 ]
 Seed = Annotated[int, Field(ge=0, description="seed of everything random"), Shown(MATCHING)]
-PriorKind = Annotated[
-    Literal["none", "georef"],
+
+
+def _plain(value: Any) -> Any:
+    """Return arrays as lists and paths as text, so that Python may give either."""
+    if isinstance(value, Path):
+        return str(value)
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def _pose(value: Any) -> Any:
+    """Return a pose as given: text, or four rows of four numbers."""
+    value = _plain(value)
+    if isinstance(value, str):
+        return value
+    try:
+        rows = [[float(one) for one in row] for row in value]
+    except (TypeError, ValueError):
+        rows = []
+    finite = all(isfinite(one) for row in rows for one in row)
+    if [len(row) for row in rows] != [4] * 4 or not finite:
+        raise ValueError("input should be none, georef, a file, or a matrix of four rows of four numbers")
+    return rows
+
+
+Row = tuple[float, float, float, float]
+PriorPose = Annotated[
+    str | tuple[Row, Row, Row, Row],
+    BeforeValidator(_pose),
     Field(
-        description="where to search: none everywhere, at any yaw; georef only near the place that both "
-        "clouds' CRSs give"
+        description="pose known beforehand, near which is searched: none; georef, where both clouds' CRSs "
+        "put the source; or a file with a 4x4 from coordinates of the source's file to the target's: a "
+        "transform.json, JSON, or four rows of four numbers"
     ),
-    Shown(PRIOR, ("--prior",)),
+    Shown(PRIOR, ("--prior",), metavar="none|georef|FILE"),
 ]
-PriorSigma = Annotated[
-    float,
+Near = Annotated[
+    tuple[float, float] | None,
+    BeforeValidator(_plain),
     Field(
-        gt=0,
-        allow_inf_nan=False,
-        description="under the prior: standard deviation of the source's place, metres",
+        description="place in the target's CRS near which the middle of the source lies (the mean of its "
+        "points in plan): easting and northing, or longitude and latitude, in the CRS's units"
+    ),
+    Shown(PRIOR, metavar="X Y"),
+]
+NearCrs = Annotated[
+    str | None,
+    Field(
+        description="CRS of --near, if not the target's; EPSG:4326 takes longitude and latitude in degrees, "
+        "in this order"
     ),
     Shown(PRIOR),
 ]
-PriorYaw = Annotated[
-    float,
+Within = Annotated[
+    float | None,
+    Field(
+        gt=0,
+        allow_inf_nan=False,
+        description="how far the middle of the source may lie from --near or from where --prior puts it, "
+        "metres; if not given as far as the source reaches from its middle, under --prior 15",
+    ),
+    Shown(PRIOR),
+]
+Yaw = Annotated[
+    float | None,
+    Field(
+        ge=-360,
+        le=360,
+        allow_inf_nan=False,
+        description="angle by which the source must be turned to fit the target, degrees, counter-clockwise "
+        "seen from above: the direction of its x axis in the target, counted from the target's x axis",
+    ),
+    Shown(PRIOR),
+]
+YawTolerance = Annotated[
+    float | None,
     Field(
         gt=0,
         le=180,
         allow_inf_nan=False,
-        description="under the prior: largest difference of yaw considered, degrees",
+        description="largest difference from --yaw or from the yaw of --prior, degrees; if not given 15, "
+        "under --prior 5",
     ),
     Shown(PRIOR),
 ]
+PriorSigma = Annotated[
+    float | None,
+    Field(
+        gt=0,
+        allow_inf_nan=False,
+        description="under --prior: standard deviation of the source's place, metres; --within is three "
+        "times that",
+    ),
+    Shown(PRIOR),
+]
+PriorYaw = Annotated[
+    float | None,
+    Field(
+        gt=0,
+        le=180,
+        allow_inf_nan=False,
+        description="under --prior: the same as --yaw-tolerance, degrees",
+    ),
+    Shown(PRIOR),
+]
+PRIOR_WITHIN_M, PRIOR_YAW_TOLERANCE_DEG, YAW_TOLERANCE_DEG = 15.0, 5.0, 15.0
+
+
+class PriorOptions(BaseModel):
+    """What is known beforehand of where the source lies, and how well."""
+
+    prior: PriorPose = "none"
+    near: Near = None
+    near_crs: NearCrs = None
+    within: Within = None
+    yaw: Yaw = None
+    yaw_tolerance: YawTolerance = None
+    prior_sigma: PriorSigma = None
+    prior_yaw: PriorYaw = None
+
+    @model_validator(mode="after")
+    def _go_together(self) -> PriorOptions:
+        problem = _prior_problem(self)
+        if problem:
+            raise ValueError(problem)
+        return self
+
+    @property
+    def knows_pose(self) -> bool:
+        """Return whether a whole pose is given, from the georeference or as a 4x4."""
+        return self.prior != "none"
+
+    @property
+    def prior_file(self) -> Path | None:
+        """Return the file of the 4x4, or None."""
+        named = isinstance(self.prior, str) and self.prior not in PRIOR_WORDS
+        return Path(str(self.prior)) if named else None
+
+    @property
+    def within_m(self) -> float | None:
+        """Return how far the source may lie from the place known, metres; None where nothing says."""
+        if self.within is not None:
+            return self.within
+        if not self.knows_pose:
+            return None
+        return PRIOR_WITHIN_M if self.prior_sigma is None else 3.0 * self.prior_sigma
+
+    @property
+    def yaw_within_deg(self) -> float:
+        """Return how far it may be turned from the yaw known, degrees."""
+        given = self.prior_yaw if self.yaw_tolerance is None else self.yaw_tolerance
+        if given is not None:
+            return given
+        return PRIOR_YAW_TOLERANCE_DEG if self.knows_pose else YAW_TOLERANCE_DEG
+
+
+PRIOR_WORDS = ("none", "georef")
+
+
+def _prior_problem(options: PriorOptions) -> str:
+    """Return what in options of a prior does not go together, and what to do; "" where all does."""
+    word = options.prior
+    if isinstance(word, str) and word not in PRIOR_WORDS and re.fullmatch(r"[\w-]*", word):
+        return (
+            f"--prior is none, georef or a file, not {word!r}{meant(word, PRIOR_WORDS)}; a file of that name "
+            f"is ./{word}"
+        )
+    named = "georef" if word == "georef" else "file" if options.prior_file else "matrix"
+    posed = options.knows_pose
+    rules = (
+        (posed and options.near is not None, f"--near and --prior {named} both say where the source lies; "
+         "leave one of them out"),
+        (posed and options.yaw is not None, f"--yaw and --prior {named} both say how the source is turned; "
+         "leave --yaw out, and say by --yaw-tolerance how well the prior knows it"),
+        (options.near_crs is not None and options.near is None, "--near-crs is of use with --near only; give "
+         "--near X Y in that CRS"),
+        (options.within is not None and options.near is None and not posed, "--within has nothing to be "
+         "counted from; give --near X Y or --prior"),
+        (options.yaw_tolerance is not None and options.yaw is None and not posed, "--yaw-tolerance has "
+         "nothing to be counted from; give --yaw or --prior"),
+        (options.prior_sigma is not None and not posed, "--prior-sigma is of use with --prior only; with "
+         "--near give --within"),
+        (options.prior_yaw is not None and not posed, "--prior-yaw is of use with --prior only; with --yaw "
+         "give --yaw-tolerance"),
+        (options.within is not None and options.prior_sigma is not None, "--within and --prior-sigma say the "
+         "same; leave one of them out"),
+        (options.yaw_tolerance is not None and options.prior_yaw is not None, "--yaw-tolerance and "
+         "--prior-yaw say the same; leave one of them out"),
+    )  # fmt: skip
+    return next((text for wrong, text in rules if wrong), "")
+
+
 Motion = Annotated[
     Literal["rigid", "yaw", "translation"],
     Field(description="degrees of freedom of the result: all six, yaw and shift, or the shift alone"),
@@ -156,7 +324,7 @@ def shown_of(kind: Any) -> Shown:
     return next(part for part in get_args(kind)[1:] if isinstance(part, Shown))
 
 
-class MethodOptions(BaseModel):
+class MethodOptions(PriorOptions):
     """Options of the method, from levelling to verdict."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -168,9 +336,6 @@ class MethodOptions(BaseModel):
     cell: Cell = None
     vertical: Vertical = "refuse"
     out_crs: OutCrs = None
-    prior: PriorKind = "none"
-    prior_sigma: PriorSigma = 5.0
-    prior_yaw: PriorYaw = 5.0
     motion: Motion = "rigid"
     profile: Annotated[
         Literal["default", "paper"],
@@ -226,19 +391,22 @@ def first_problem(error: ValidationError, model: type[BaseModel], spelt: Callabl
         error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden"
     )
     problem = problems[0]
-    name = ".".join(str(part) for part in problem["loc"]) or "options"
+    # a part of an option, such as a number of two, is named by the whole
+    name = str(problem["loc"][0]) if problem["loc"] else "options"
     names = [field.alias or key for key, field in model.model_fields.items()]
     if problem["type"] == "extra_forbidden":
         return f"no option {spelt(name)}{meant(name, names)}"
     if problem["type"] == "missing":
         return f"the option {spelt(name)} is missing"
     message = problem["msg"].removeprefix("Value error, ")
+    if not problem["loc"]:  # several options that do not go together
+        return message
     message = message[:1].lower() + message[1:]
     return f"option {spelt(name)}: {message}, got {_short(problem['input'])}"
 
 
 def _short(value: Any) -> str:
-    text = repr(value)
+    text = " ".join(repr(value).split())
     return text if len(text) <= 60 else text[:57] + "..."
 
 

@@ -51,6 +51,7 @@ class Evidence:
         final_agreeing: of all tie points, those that agree with the final transform; None if not counted.
         refinement_lost: whether surfaces fit better where the tie points do not agree, and the tie points
             were followed.
+        contradictions: what was known beforehand and is not so, a sentence each.
 
     """
 
@@ -71,6 +72,7 @@ class Evidence:
     refinement_lost: bool = False
     null_ratio: float | None = None
     least_overlap_m2: float = 400.0
+    contradictions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,7 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
         refusals.append(shared)
     elif evidence.overlap_m2 < least:
         doubts.append(shared)
+    doubts += evidence.contradictions
     if len(doubts) >= 2 and digits < limits.neg_log10_p:
         refusals.append("several checks fail at once: " + "; ".join(doubts))
         doubts = []

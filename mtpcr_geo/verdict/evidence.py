@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,25 +21,6 @@ GROUND_AGREES_M = 0.5
 UNBOUNDED_CELLS = 2.0
 TIE_POINTS_PER_PATCH = 4
 """Patches overlap by half, so about four tie points tell what one independent tie would."""
-
-
-@dataclass(frozen=True)
-class PriorComparison:
-    """How many tie points and how many cells of ground agree with what was found, and with the prior.
-
-    Attributes:
-        found: of the transform found.
-        prior: of the one known beforehand.
-
-    """
-
-    found: tuple[int, int]
-    prior: tuple[int, int]
-
-    @property
-    def keep_prior(self) -> bool:
-        """Whether at least as many of both agree with the prior."""
-        return self.prior[0] >= self.found[0] and self.prior[1] >= self.found[1]
 
 
 def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[str, Any]]:
@@ -164,24 +144,6 @@ def cross_validated(tie_points: TiePoints, tolerance: float, settings: SolveSett
         gap = transforms.apply(solution.T, tie_points.source[out]) - tie_points.target[out]
         residual[out] = np.hypot(gap[:, 0], gap[:, 1])
     return residual
-
-
-def prior_or_found(pair: Pair, tolerance: float | None = None) -> PriorComparison:
-    """Compare what was found with the transform known beforehand, by how much agrees with each.
-
-    Args:
-        pair: solved, with a prior, rasters and tie points.
-        tolerance: plan distance within which a tie point agrees, metres; one cell if None.
-
-    Raises:
-        ValueError: if the pair has no prior or no transform.
-
-    """
-    if pair.T_prior is None or pair.T_target_source is None:
-        raise ValueError("a comparison needs a prior and a transform")
-    return PriorComparison(
-        found=agreement(pair, pair.T_target_source, tolerance), prior=agreement(pair, pair.T_prior, tolerance)
-    )
 
 
 def _refined_away(pair: Pair, T: Floats) -> float:

@@ -147,15 +147,25 @@ def test_the_command_gives_register_the_defaults_of_python(tmp_path, monkeypatch
 def test_every_option_reaches_register(monkeypatch):
     values = {
         "source_crs": "EPSG:2154", "target_crs": "EPSG:25832", "local": True, "level": "none", "cell": 0.75,
-        "vertical": "estimate", "out_crs": "EPSG:25833", "prior": "georef", "prior_sigma": 7.5,
-        "prior_yaw": 8.0, "motion": "yaw", "profile": "paper", "matcher": "orb", "models": "folder",
+        "vertical": "estimate", "out_crs": "EPSG:25833", "prior": "none", "near": (4.5, -52.0),
+        "near_crs": "EPSG:4326", "within": 40.0, "yaw": -30.0, "yaw_tolerance": 8.0,
+        "motion": "yaw", "profile": "paper", "matcher": "orb", "models": "folder",
         "res": False, "focus": False, "enhance": False, "seed": 4, "recording": False, "force": True,
         "overwrite": True,
     }  # fmt: skip
-    assert set(values) == set(RegisterOptions.model_fields)
+    # with a whole pose there is neither place nor yaw
+    posed = {"prior": "georef", "prior_sigma": 7.5, "prior_yaw": 8.0}
+    assert set(values) | set(posed) == set(RegisterOptions.model_fields)
+    reaches_register(monkeypatch, values)
+    reaches_register(monkeypatch, posed)
+
+
+def reaches_register(monkeypatch, values):
     words = ["register", "a.laz", "b.laz", "--out", "out", "--dump-pipeline"]
     for name, field in RegisterOptions.model_fields.items():
-        words += [spelling(name, field)[0], *([] if isinstance(values[name], bool) else [str(values[name])])]
+        if name in values:
+            parts = values[name] if isinstance(values[name], tuple) else (values[name],)
+            words += [spelling(name, field)[0], *(str(one) for one in parts if not isinstance(one, bool))]
     given: dict[str, RegisterOptions] = {}
     monkeypatch.setattr(
         "mtpcr_geo.registration.build_pipeline", lambda *args: given.setdefault("o", args[-1]) and []

@@ -11,8 +11,9 @@ import mtpcr_geo as mg
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.types import Bev, Hypothesis, Matches
 from mtpcr_geo.match.candidates import Candidate, Pool, same_pose
-from mtpcr_geo.match.correlation import CorrelationSettings, Prior, match, mirror
+from mtpcr_geo.match.correlation import CorrelationSettings, match, mirror
 from mtpcr_geo.match.pose import Pose
+from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.terrain import GroundComparison
 from mtpcr_geo.method.bev import grid_around, rasterise
 from mtpcr_geo.method.scales import Scales
@@ -119,8 +120,10 @@ def test_the_mirrored_search_changes_no_match(towns: tuple[np.ndarray, np.ndarra
     assert without.report["mirrored_strengths"] is None
     assert without.hypotheses == found.hypotheses
     assert np.array_equal(without.source_px, found.source_px)
-    near = match(source, target, prior=Prior(found.hypotheses[0], 10.0, 0.1))
-    assert near.null_ratio is None
+    # under a prior the mirrored source is searched near the same place, at every yaw
+    near = match(source, target, prior=Prior.around(found.hypotheses[0], (0.0, 0.0), 10.0, 0.1))
+    assert near.null_ratio is not None
+    assert near.null_ratio > 2.0
 
 
 def test_exchanged_clouds_give_the_inverse(towns: tuple[np.ndarray, np.ndarray], found: Matches) -> None:

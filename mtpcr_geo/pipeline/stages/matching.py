@@ -4,23 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.core.types import Appearance, Bev, Look, Pair, Side
-from mtpcr_geo.pipeline.options import MatcherName, Models, PriorKind, PriorSigma, PriorYaw, Seed
+from mtpcr_geo.core.types import Appearance, Bev, Look, Side
+from mtpcr_geo.pipeline.options import MatcherName, Models, PriorOptions, Seed
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
-from mtpcr_geo.pipeline.stages.pairs import bevs_of, georeference
+from mtpcr_geo.pipeline.stages.pairs import bevs_of
+from mtpcr_geo.pipeline.stages.priors import audit_of, known_place, prior_of
 
 if TYPE_CHECKING:
     from mtpcr_geo.match.base import Matcher, View
-    from mtpcr_geo.match.correlation import Prior
+    from mtpcr_geo.match.prior import Prior
 
-_FOR_CORRELATION = {"yaw_step", "patch", "search_radius", "min_overlap", "prior_sigma"}
+_FOR_CORRELATION = {"yaw_step", "patch", "search_radius", "min_overlap"}
 _FOR_KEYPOINTS = {
     "models", "turns", "tolerance", "max_keypoints", "tile", "ratio", "cross_check", "device", "threads",
 }  # fmt: skip
@@ -68,7 +69,7 @@ class Enhance(Stage):
         return Appearance(self.options.look, grey(side.bev), image_of(side.bev, self.options.look))
 
 
-class MatchOptions(StageOptions):
+class MatchOptions(PriorOptions, StageOptions):
     """Options of mtpcr.match."""
 
     method: MatcherName = "correlation"
@@ -93,9 +94,6 @@ class MatchOptions(StageOptions):
         ge=0,
         description="smallest overlap considered, square metres; from the clouds' area if not given",
     )
-    prior: PriorKind = "none"
-    prior_sigma: PriorSigma = 5.0
-    prior_yaw: PriorYaw = 5.0
     models: Models = None
     turns: int = Field(
         8, ge=1, le=72, description="orientations in which learned matchers are tried, round the circle"
@@ -142,6 +140,10 @@ class Match(Stage):
 
     _matcher: Matcher | None = None
 
+    def reads(self) -> list[Path]:
+        """Return the file of the prior, if there is one."""
+        return [] if self.options.prior_file is None else [self.options.prior_file]
+
     def check(self, context: RunContext) -> None:
         """Find out whether there is such a matcher, with its files, and whether the options are its own."""
         correlation = self.options.method == "correlation"
@@ -162,7 +164,10 @@ class Match(Stage):
         """Match the source's raster to the target's."""
         pair = self.one_pair(inputs)
         source, target = bevs_of(self, pair)
-        prior = self._prior(pair)
+        known = known_place(self.options, pair, self.label)
+        prior = None if known is None else prior_of(known, pair)
+        if known is not None:
+            self.metadata["prior"] = audit_of(known, pair)
         trusted = pair.source.levelling.trusted and pair.target.levelling.trusted
         matcher = self._matcher or self._make(prior, trusted)
         if matcher.needs_one_cell and source.grid.cell != target.grid.cell:
@@ -173,8 +178,8 @@ class Match(Stage):
         if matcher.needs_image:
             pair = pair.with_(source=shown(pair.source), target=shown(pair.target))
         yaw = None
-        if prior is not None and self.options.prior_yaw <= TOLERATED_ROTATION_DEG:
-            yaw = prior.hypothesis.yaw
+        if prior is not None and prior.yaw_range <= np.radians(TOLERATED_ROTATION_DEG):
+            yaw = prior.yaw
         with context.progress.task("searching all yaws" if prior is None else "searching", None) as advance:
             matches = matcher.match(
                 view_of(pair.source, matcher.needs_image),
@@ -184,8 +189,7 @@ class Match(Stage):
                 advance=advance,
             )
         self.metadata |= {"matches": len(matches.score), **matches.report}
-        known = None if prior is None else georeference(pair, self.label)
-        return pair.with_(matches=replace(matches, matcher=matcher), T_prior=known)
+        return pair.with_(matches=replace(matches, matcher=matcher), known=known)
 
     def _make(self, prior: Prior | None, trust_vertical: bool = True) -> Matcher:
         from mtpcr_geo.match.correlation import CorrelationSettings
@@ -213,19 +217,6 @@ class Match(Stage):
             threads=o.threads,
         )
         return make_matcher(o.method, correlation, keypoints)
-
-    def _prior(self, pair: Pair) -> Prior | None:
-        """Turn the shared georeference into a hypothesis between the levelled clouds."""
-        from mtpcr_geo.core.types import Hypothesis
-        from mtpcr_geo.match.correlation import Prior
-
-        if self.options.prior == "none":
-            return None
-        T = georeference(pair, self.label)
-        T_level = pair.levelled(T)
-        shift = (float(T_level[0, 3]), float(T_level[1, 3]))
-        known = Hypothesis(transforms.yaw_of(T_level[:3, :3]), shift, 0.0)
-        return Prior(known, 3.0 * self.options.prior_sigma, float(np.radians(self.options.prior_yaw)))
 
 
 class FocusOptions(StageOptions):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import ClassVar
 
 from mtpcr_geo.pipeline.options import MethodOptions
@@ -33,6 +34,10 @@ class Register(Stage):
         """Check every step."""
         for step in self.steps:
             step.check(context)
+
+    def reads(self) -> list[Path]:
+        """Return the files that any step reads."""
+        return [path for step in self.steps for path in step.reads()]
 
     def check_inputs(self, inputs: Sequence[Value], context: RunContext) -> None:
         """Check the clouds as the first step does."""

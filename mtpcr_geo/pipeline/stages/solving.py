@@ -263,6 +263,7 @@ class Assess(Stage):
         """Gather the evidence and judge."""
         from mtpcr_geo.verdict.decision import Limits, assess
         from mtpcr_geo.verdict.evidence import gather
+        from mtpcr_geo.verdict.prior import departure
 
         pair = self.one_pair(inputs)
         if pair.T_target_source is None or pair.tie_points is None:
@@ -270,6 +271,8 @@ class Assess(Stage):
         options = self.options
         pair = self._no_worse_than_prior(pair)
         evidence, more = gather(pair, options.tolerance)
+        distances, contradictions = departure(pair)
+        evidence, more = replace(evidence, contradictions=contradictions), more | distances
         limits = Limits(
             neg_log10_p=options.neg_log10_p,
             agreeing=options.agreeing,
@@ -282,8 +285,8 @@ class Assess(Stage):
         return pair.with_(verdict=verdict)
 
     def _no_worse_than_prior(self, pair: Pair) -> Pair:
-        """Keep the transform known beforehand where more tie points and as much ground agree with it."""
-        from mtpcr_geo.verdict.evidence import prior_or_found
+        """Keep the transform known beforehand where tie points, ground and surfaces agree with it as well."""
+        from mtpcr_geo.verdict.prior import prior_or_found
 
         if pair.T_prior is None or pair.T_target_source is None:
             return pair
@@ -291,6 +294,7 @@ class Assess(Stage):
         self.metadata |= {
             "tie_points_and_ground_agreeing": compared.found,
             "with_prior": compared.prior,
+            "surface_residual": [compared.found_residual, compared.prior_residual],
             "prior_kept": compared.keep_prior,
         }
         return pair.with_(T_target_source=pair.T_prior) if compared.keep_prior else pair

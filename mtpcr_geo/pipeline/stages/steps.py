@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.io.memory import cloud_of
-from mtpcr_geo.pipeline.options import OUTPUT_NAMES, MethodOptions
+from mtpcr_geo.pipeline.options import OUTPUT_NAMES, MethodOptions, PriorOptions
 from mtpcr_geo.pipeline.stage import Stage
 from mtpcr_geo.pipeline.stages.export import (
     Apply,
@@ -113,22 +113,17 @@ def _method(options: MethodOptions, prefix: str) -> list[Stage]:
 
 def _match_options(options: MethodOptions, matcher: str) -> MatchOptions:
     models = None if matcher == "correlation" else options.models
-    if options.prior == "none":
-        return MatchOptions(method=matcher, models=models, seed=options.seed)
-    return MatchOptions(
-        method=matcher,
-        models=models,
-        prior=options.prior,
-        prior_sigma=options.prior_sigma,
-        prior_yaw=options.prior_yaw,
-        seed=options.seed,
-    )
+    # what is not given stays so, as in pipelines written by hand
+    known = {name: getattr(options, name) for name in PriorOptions.model_fields}
+    return MatchOptions(method=matcher, models=models, seed=options.seed, **known)
 
 
 def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
     """Make the steps from raster to verdict as MT-PCR has them."""
-    if options.prior != "none" or options.motion != "rigid":
-        raise OptionError("--prior and --motion are not of the paper; leave them out, or --profile paper")
+    if options.knows_pose or options.near is not None or options.yaw is not None or options.motion != "rigid":
+        raise OptionError(
+            "--prior, --near, --yaw and --motion are not of the paper; leave them out, or --profile paper"
+        )
     seed = options.seed
     # without RES coordinates stay metres, and Eq. 2 makes pixels of one
     bev = (
