@@ -24,8 +24,11 @@ not be asked: the margin could not fall below this."""
 MAX_RADIUS_CELLS = 10
 WIDE_PATCH_CELLS = 24
 """Cells along a patch from which the first look at a hypothesis is taken at cells twice as large."""
-FAINT = 2.0
-"""Times by which the second, closer look at a hypothesis may find it stronger than the first."""
+LEAST_FILL = 0.25
+"""Share of a patch's cells that must be filled in both rasters; half of what is usual in thin ones."""
+FAINT = 3.0
+"""Times by which the best strength exceeds that of a first look where the second, closer one is not taken: it
+seldom changes a strength by half, and a margin of two is clear."""
 
 
 @dataclass(frozen=True)
@@ -87,15 +90,15 @@ class Judge:
         """Match patches around a pose, let them correct it, and match again from there.
 
         The first look is a wide one, at cells twice as large where patches still hold enough of them. Where
-        so few patches agree already there that the pose cannot come within `CLEAR_MARGIN` of the strength
-        ``known``, the second is not taken.
+        so few patches agree already there that the pose will not come near the strength ``known``, the second
+        is not taken.
         """
         fine, cell = self.pyramid.at(1), self.scales.cell_m
         factor = 2 if self.patch_m >= WIDE_PATCH_CELLS * cell else 1
         radius = min(max(self.radius_cells, round(self.search_radius_m / cell)), MAX_RADIUS_CELLS)
         patches, supporting = self._patches(factor, pose, max(1, round(radius / factor)))
         first = Candidate(pose, patches, supporting, self._compare_ground(pose))
-        if FAINT * first.strength * CLEAR_MARGIN < known:
+        if FAINT * first.strength < known:
             return first
         corrected = _corrected(pose, patches, supporting, self.pyramid.at(factor), self._agree_m, fine[0])
         rescored = score_nearby(*fine, corrected, 1)[0]
@@ -114,7 +117,8 @@ class Judge:
         if factor > 1:
             pose = pose_of(pose.hypothesis(centre_of(self.pyramid.source.grid)), centre_of(source.grid))
         stride = max(4, round(self.patch_m / 2 / source.grid.cell))
-        found = match_patches(source, target, pose, window=window, stride=stride)
+        fill = min(LEAST_FILL, self.scales.fill / 2)
+        found = match_patches(source, target, pose, window=window, stride=stride, min_fill=fill)
         s, t = source.grid.to_metres(found.source_px), target.grid.to_metres(found.target_px)
         return found, ransac_upright(s, t, self._agree_m, self.seed, 500)[1]
 

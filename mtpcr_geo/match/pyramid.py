@@ -14,8 +14,9 @@ from mtpcr_geo.method.images import channels
 COARSEST_SEARCH_M = 8.0
 FEWEST_ACROSS = 40
 """Cells along the smaller raster's longer side that the coarsest level of the search leaves at least."""
-LARGEST_SEARCH = 420
-"""Cells along a raster's side up to which a level is searched over all yaws in about two seconds."""
+LARGEST_SEARCH = 840
+"""Cells along the larger raster and across the smaller together up to which a level is searched over all yaws
+in a few seconds."""
 LEVELS = 3
 
 
@@ -63,7 +64,8 @@ def search_factors(source: Bev, target: Bev) -> list[int]:
     longest = max(max(bev.grid.shape) for bev in (source, target))
     shortest = min(max(bev.grid.shape) for bev in (source, target))
     wanted = max(min(shortest / FEWEST_ACROSS, COARSEST_SEARCH_M / cell), 1.0)
-    affordable = max(1, int(np.ceil(longest / LARGEST_SEARCH)))
+    across = min(float(np.hypot(*bev.grid.shape)) for bev in (source, target))
+    affordable = max(1, int(np.ceil((longest + across) / LARGEST_SEARCH)))
     factors: list[int] = []
     for _ in range(LEVELS):
         factor = max(round(wanted), affordable)

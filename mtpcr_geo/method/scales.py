@@ -10,7 +10,8 @@ length              rule                                     limits
 cell                so that a cell of the sparser cloud      0.25 to 8 m
                     holds 1.2 points, but no finer than
                     1/200 of the extent, or 1 m
-patch               1/4 of the extent, at least 12 cells     at most 24 m
+patch               1/4 of the extent, at least 12 cells     at most 24 m; more, up to
+                    and 40 that are filled in both           1/2 the extent, if sparse
 search radius       1/4 of a patch, at least 3 cells         at most 6 m
 block               1/5 of the tie points' extent,           at most 40 m
                     at least a cell
@@ -32,6 +33,10 @@ from mtpcr_geo.core.types import Bev
 from mtpcr_geo.method.bev import OCCUPANCY_CELL_M, coarsen
 
 MAX_PATCH_M, MIN_PATCH_CELLS = 24.0, 12
+FEWEST_FILLED_IN_PATCH = 40
+"""Cells filled in both rasters that a patch should hold: fewer do not tell one place from the next."""
+FILL_BLOCK = 8
+"""Cells along the blocks within which the share of filled cells counts: larger gaps are not of a raster."""
 MAX_SEARCH_RADIUS_M, MIN_SEARCH_RADIUS_CELLS = 6.0, 3
 MAX_BLOCK_M, BLOCKS_PER_EXTENT = 40.0, 5.0
 MAX_LEAST_OVERLAP_M2, LEAST_OVERLAP_SHARE = 400.0, 0.2
@@ -53,6 +58,7 @@ class Scales:
         least_overlap_m2: smallest overlap considered, square metres.
         terrain_cell_m: cell in which the shape of the ground is compared, metres.
         same_pose_m: poses closer than this are one, metres.
+        fill: share of the cells that would be filled in both rasters where both have points.
 
     """
 
@@ -63,6 +69,7 @@ class Scales:
     least_overlap_m2: float
     terrain_cell_m: float
     same_pose_m: float
+    fill: float = 1.0
 
     @property
     def tolerance_m(self) -> float:
@@ -76,12 +83,28 @@ def occupied_area(bev: Bev) -> float:
     return float((coarse.count > 0).sum()) * coarse.grid.cell**2
 
 
+def filled_share(bev: Bev) -> float:
+    """Return the share of filled cells in blocks of 8 x 8 cells that hold any, 0..1."""
+    filled = bev.count > 0
+    rows, columns = (-(-n // FILL_BLOCK) * FILL_BLOCK for n in filled.shape)
+    padded = np.zeros((rows, columns), bool)
+    padded[: filled.shape[0], : filled.shape[1]] = filled
+    blocks = padded.reshape(rows // FILL_BLOCK, FILL_BLOCK, columns // FILL_BLOCK, FILL_BLOCK).sum(
+        axis=(1, 3)
+    )
+    held = blocks > 0
+    return float(blocks[held].mean()) / FILL_BLOCK**2 if held.any() else 0.0
+
+
 def scales_of(source: Bev, target: Bev) -> Scales:
     """Derive the lengths of search and judgement from two rasters; see the table above."""
     cell = max(source.grid.cell, target.grid.cell)
     areas = [occupied_area(bev) for bev in (source, target)]
     extent = float(np.sqrt(max(min(areas), cell**2)))
-    patch = max(min(extent / 4.0, MAX_PATCH_M), MIN_PATCH_CELLS * cell)
+    fill = filled_share(source) * filled_share(target)
+    fewest = MIN_PATCH_CELLS * cell
+    filled = min(float(np.sqrt(FEWEST_FILLED_IN_PATCH / max(fill, 0.01))) * cell, extent / 2.0)
+    patch = max(min(extent / 4.0, MAX_PATCH_M), fewest, filled)
     return Scales(
         cell_m=cell,
         extent_m=extent,
@@ -91,6 +114,7 @@ def scales_of(source: Bev, target: Bev) -> Scales:
         terrain_cell_m=float(
             np.clip(max(extent / 8.0, 4.0 * cell), MIN_TERRAIN_CELL_M, max(MAX_TERRAIN_CELL_M, 4.0 * cell))
         ),
+        fill=fill,
         same_pose_m=float(np.clip(patch / 2.0, MIN_SAME_POSE_M, MAX_SAME_POSE_M)),
     )
 
