@@ -126,7 +126,7 @@ def summarise(rows: Iterable[Row]) -> list[dict[str, Any]]:
     Returns:
         Lines with the counts ``runs``, ``accepted``, ``right`` (whatever the verdict), ``right_accepted``,
         ``wrong_accepted``, ``precise`` and ``failed``; medians and worst of the errors of the right runs; and
-        the median time.
+        the median times.
 
     """
     rows = list(rows)
@@ -163,8 +163,9 @@ def _sums(rows: Sequence[Row]) -> dict[str, Any]:
     for short, name in (("rot_deg", "rot_err_deg"), ("plan_m", "plan_err_m"), ("dz_m", "dz_err_m")):
         line[f"{short}_median"] = figure(name, np.median)
         line[f"{short}_max"] = figure(name, np.max)
-    times = [row["time_s"] for row in rows if row["time_s"] is not None]
-    line["time_s_median"] = float(np.median(times)) if times else None
+    for name in ("time_s", "cpu_s"):
+        times = [row[name] for row in rows if row[name] is not None]
+        line[f"{name}_median"] = float(np.median(times)) if times else None
     return line
 
 
