@@ -107,13 +107,16 @@ class _Field:
         self.scene.add_boxes(xy, yaw, cabin, z + body, roof_from_ground=0.5)
 
 
-def repeating_pair(kind: RepeatingKind, seed: int, *, apart: bool = False) -> tuple[Floats, Floats]:
+def repeating_pair(
+    kind: RepeatingKind, seed: int, *, apart: bool = False, size: float = 1.0
+) -> tuple[Floats, Floats]:
     """Sample both clouds of a field that repeats itself.
 
     Args:
         kind: one of `KINDS`.
         seed: of everything.
         apart: whether they show two parts that share nothing; else they share `OVERLAP` of the source.
+        size: of both clouds' edges over `SOURCE_M` and `TARGET_M`.
 
     Returns:
         (n, 3) source and (m, 3) target in the field's frame, metres: the truth between them is the identity.
@@ -121,7 +124,7 @@ def repeating_pair(kind: RepeatingKind, seed: int, *, apart: bool = False) -> tu
     """
     words = [seed, *kind.encode()]
     rng = np.random.default_rng([51, *words])
-    source, target = _rectangles(rng, apart)
+    source, target = _rectangles(rng, apart, size)
     around = Rectangle(
         np.minimum(source.low, target.low) - _MARGIN_M, np.maximum(source.high, target.high) + _MARGIN_M
     )
@@ -140,17 +143,18 @@ def repeating_pair(kind: RepeatingKind, seed: int, *, apart: bool = False) -> tu
     return low, high
 
 
-def _rectangles(rng: np.random.Generator, apart: bool) -> tuple[Rectangle, Rectangle]:
+def _rectangles(rng: np.random.Generator, apart: bool, size: float) -> tuple[Rectangle, Rectangle]:
     """Place the target's rectangle at a corner of the source's, or beyond one of its sides."""
-    source = Rectangle(np.zeros(2), SOURCE_M.copy())
+    edges, reach = size * SOURCE_M, size * TARGET_M
+    source = Rectangle(np.zeros(2), edges)
     share = rng.uniform(0.38, 0.72)
-    shared = SOURCE_M * [share, OVERLAP / share]
+    shared = edges * [share, OVERLAP / share]
     side = rng.integers(0, 2, 2)
-    low = np.where(side == 1, SOURCE_M - shared, shared - TARGET_M)
+    low = np.where(side == 1, edges - shared, shared - reach)
     if apart:
         axis, gap = rng.integers(0, 2), rng.uniform(10.0, 40.0)
-        low[axis] = SOURCE_M[axis] + gap if side[axis] else -TARGET_M[axis] - gap
-    return source, Rectangle(low, low + TARGET_M)
+        low[axis] = edges[axis] + gap if side[axis] else -reach[axis] - gap
+    return source, Rectangle(low, low + reach)
 
 
 def _land(around: Rectangle, rng: np.random.Generator) -> HeightAt:

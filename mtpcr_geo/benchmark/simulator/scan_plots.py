@@ -14,8 +14,8 @@ from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.voxels import first_in_voxels
 
-BEAMS_PER_SCAN = 900_000
-VOXEL_M = 0.04
+BEAMS_PER_SCAN = 600_000
+VOXEL_M = 0.05
 MAST_M = 1.7
 HILLS_M = 1.0
 """Standard deviation of the relief of a site on which the even slope is given."""
