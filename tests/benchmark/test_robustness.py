@@ -105,6 +105,7 @@ def test_truth_recovers_the_coordinates_from_any_start():
 
 def test_errors_are_those_of_the_middle_of_the_overlap():
     clouds = Case("pairs", "town", "whole", Town()).clouds()
+    assert clouds.T_target_source is not None
     off = transforms.translation((0.3, -0.4, 0.1)) @ transforms.about(
         clouds.middle, transforms.yaw_matrix(np.deg2rad(1.0))
     )
@@ -136,6 +137,7 @@ def test_levelled_case_keeps_the_targets_crs_and_its_truth():
     assert clouds.options["target_crs"] == "EPSG:2154"
     assert clouds.options["source_crs"] == "local"
     assert clouds.target.mean(axis=0)[1] > 6e6
+    assert clouds.T_target_source is not None
     back = transforms.apply(clouds.T_target_source, clouds.source)
     assert np.abs(back - [7e5, 6.6e6, 100.0] - Town().make().source).max() < 1e-6
     assert errors_of(clouds.T_target_source, clouds)["shift_err_m"] < 1e-6
