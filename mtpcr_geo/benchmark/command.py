@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from pydantic import Field
@@ -12,7 +12,11 @@ from mtpcr_geo.benchmark.simulator.options import PairOptions
 from mtpcr_geo.cli.options import Quiet as QuietOption
 from mtpcr_geo.cli.parameters import command_of
 from mtpcr_geo.cli.shared import Quiet, progress_bars
+from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.pipeline.options import RUN, Overwrite, Shown
+
+if TYPE_CHECKING:
+    from mtpcr_geo.benchmark.robustness.suites import SuiteOptions
 
 
 def benchmark(
@@ -32,6 +36,13 @@ def benchmark(
         list[str],
         typer.Option("--methods", "-m", help="Methods, with options: 'mtpcr-geo kiss-matcher:voxel=1'."),
     ] = ["mtpcr-geo"],  # noqa: B006 - typer copies it
+    robustness: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Run suites of the robustness benchmark instead, such as 'pairs discs', or all; --data is "
+            "then the folder of real pairs."
+        ),
+    ] = None,
     starts: Annotated[int, typer.Option(min=1, help="Random starts of each pair.")] = 10,
     jobs: Annotated[int, typer.Option(min=1, help="Runs at a time.")] = 1,
     yaw: Annotated[float, typer.Option(help="Starts are turned by 0 to this, degrees.")] = 360.0,
@@ -53,6 +64,23 @@ def benchmark(
 
     An interrupted benchmark goes on where it stopped when the same command is given again.
     """
+    if robustness:
+        from mtpcr_geo.benchmark.robustness.suites import SuiteOptions
+
+        if data and len(data) > 1:
+            raise OptionError("--robustness takes one folder of pairs")
+        chosen = SuiteOptions(
+            data=data[0] if data else None,
+            cache=pairs or out / "pairs",
+            starts=starts,
+            seed=seed,
+            only=tuple(only or ()),
+            shift_m=shift,
+        )
+        _robustness(
+            [word for text in robustness for word in text.split()], chosen, out, jobs, time_limit, quiet
+        )
+        return
     from mtpcr_geo.benchmark.runs import PairSelection, numbers_of, run_benchmark, shown
     from mtpcr_geo.benchmark.worker import StartRange
 
@@ -79,6 +107,17 @@ def benchmark(
         )
     if not quiet:
         typer.echo(shown(rows) + f"\nTables and plots: {out}")
+
+
+def _robustness(
+    names: list[str], chosen: SuiteOptions, out: Path, jobs: int, time_limit_s: float, quiet: bool
+) -> None:
+    from mtpcr_geo.benchmark.robustness.verb import run_suites
+
+    with progress_bars(quiet) as progress:
+        rows, report = run_suites(names, chosen, out, jobs=jobs, time_limit_s=time_limit_s, progress=progress)
+    if not quiet:
+        typer.echo(f"{report}\n{len(rows)} rows: {out}")
 
 
 class SimulateVerb(PairOptions):

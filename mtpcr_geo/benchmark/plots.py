@@ -175,3 +175,34 @@ PLOTS: dict[str, Callable[[Any, Sequence[Row]], None]] = {
     "success_overlap": _draw_overlap,
     "success_yaw": _draw_yaw,
 }
+
+
+def draw_radii(rows: Sequence[Row], path: Path) -> None:
+    """Draw the shares of right and accepted runs against the radius of discs, as PNG.
+
+    Args:
+        rows: of the robustness benchmark's suite discs; at least one.
+        path: where to.
+
+    Raises:
+        MissingPartError: if matplotlib is not installed.
+
+    """
+    plt = _pyplot()
+    figure = plt.figure(figsize=(6.4, 4.2), layout="constrained")
+    axis = figure.subplots()
+    radii = sorted({row["radius"] for row in rows})
+    runs = [[row for row in rows if row["radius"] == radius] for radius in radii]
+    drawn: dict[str, Callable[[Row], bool]] = {
+        "right": lambda row: bool(row["right"]),
+        "right and accepted": lambda row: bool(row["right"]) and row["verdict"] == "accepted",
+        "wrong and accepted": lambda row: not row["right"] and row["verdict"] == "accepted",
+    }
+    for k, (name, good) in enumerate(drawn.items()):
+        shares = [100.0 * float(np.mean([good(row) for row in part])) for part in runs]
+        axis.plot(radii, shares, marker="o", label=name, **_style(k))
+    axis.set(xlabel="radius of the disc, m", ylabel="% of runs", ylim=(-2, 102))
+    axis.grid(alpha=0.25)
+    _legend(axis)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)

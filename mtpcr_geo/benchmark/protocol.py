@@ -194,7 +194,7 @@ def _drive(waiting: deque[Task], jobs: int, limit: float, file: TextIO, advance:
                 task = waiting.popleft()
                 mine, theirs = context.Pipe(duplex=False)
                 process = context.Process(target=work, args=(task, theirs), daemon=True)
-                with _threads_of_children(task.threads):
+                with threads_of_children(task.threads):
                     process.start()
                 theirs.close()
                 running[mine] = _Running(task, process, time.monotonic(), deque(task.starts))
@@ -232,7 +232,7 @@ def _drive(waiting: deque[Task], jobs: int, limit: float, file: TextIO, advance:
 
 
 @contextmanager
-def _threads_of_children(count: int) -> Iterator[None]:
+def threads_of_children(count: int) -> Iterator[None]:
     """Let processes started meanwhile use so many threads: BLAS and OpenMP read that when they are loaded."""
     before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(_THREAD_VARIABLES, str(count)))

@@ -73,16 +73,17 @@ class Site:
         return out.build()
 
 
-def make_site(kind: Kind, seed: int, extent_m: float) -> Site:
+def make_site(kind: Kind, seed: int, extent_m: float, *, style: SiteStyle | None = None) -> Site:
     """Make a site from its seed.
 
     Args:
         kind: one of `KINDS`.
         seed: same seed, same site.
         extent_m: edge of the square, metres.
+        style: what it is made of; that of its kind if None.
 
     """
-    style = STYLES[kind]
+    style = style or STYLES[kind]
     rng = np.random.default_rng([seed, 11])
     half = extent_m / 2
     outer = half + MARGIN_M
