@@ -10,7 +10,7 @@ what chance and self-similarity score on this pair.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from mtpcr_geo.match.candidates import AGREE_TOLERANCES, RADIUS_TOLERANCES, Cand
 from mtpcr_geo.match.patches import PatchMatches, match_patches
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.pyramid import Pyramid, search_factors
+from mtpcr_geo.match.reasons import nothing_to_compare
 from mtpcr_geo.match.search import GlobalSearch, Layer, distinct, score_nearby
 from mtpcr_geo.match.terrain import FEWEST_CELLS as FEWEST_GROUND_CELLS
 from mtpcr_geo.match.terrain import Terrain, TerrainSearch, compare_ground, place_on
@@ -130,10 +131,7 @@ def match(
     search = _Search(source, target, scales, settings, seed, advance)
     pool, searched = search.explore(prior)
     if not pool.candidates:
-        raise RegistrationError(
-            "no pose brings the two rasters to overlap enough to compare; the clouds may be too small or too "
-            f"sparse for cells of {source.grid.cell:g} m: give a finer --cell, or larger clouds"
-        )
+        raise RegistrationError(nothing_to_compare(source, target, search.fewest(1), prior is not None))
     mirrored = None
     if settings.mirrored_null and prior is None:
         twin = _Search(
@@ -182,7 +180,10 @@ def match(
         source_px=patches.source_px,
         target_px=patches.target_px,
         score=np.clip(patches.score, 0.0, 1.0),
-        hypotheses=tuple(c.pose.hypothesis(pivot) for c in pool.candidates),
+        hypotheses=tuple(
+            replace(c.pose.hypothesis(pivot), strength=strength)
+            for c, strength in zip(pool.candidates, pool.strengths, strict=True)
+        ),
         search_radius_m=radius,
         margin=pool.margin,
         support=best.support,
@@ -284,13 +285,19 @@ class _Search:
         step = np.degrees(1.5 / max(rim, 1.0))
         return float(np.radians(np.clip(step, FINEST_YAW_STEP_DEG, COARSEST_YAW_STEP_DEG)))
 
+    def fewest(self, factor: int) -> float:
+        """Return how many cells of a level both rasters must fill at a pose for it to be considered."""
+        layers = self.pyramid.at(factor)
+        smaller = min(float(layer.channels.mask.sum()) for layer in layers)
+        least = self.settings.min_overlap_m2
+        least = self.scales.least_overlap_m2 if least is None else least
+        share = self.settings.min_overlap_share * smaller
+        return max(least / layers[0].grid.cell ** 2, share, FEWEST_OVERLAP_CELLS)
+
     def _propose(self, factor: int, prior: Prior | None) -> list[Pose]:
         source, target = self.pyramid.at(factor)
         cell = source.grid.cell
-        smaller = min(float(layer.channels.mask.sum()) for layer in (source, target))
-        least = self.settings.min_overlap_m2
-        least = self.scales.least_overlap_m2 if least is None else least
-        fewest = max(least / cell**2, self.settings.min_overlap_share * smaller, FEWEST_OVERLAP_CELLS)
+        fewest = self.fewest(factor)
         step = self._yaw_step(source)
         count = round(2 * np.pi / step)
         yaws = np.arange(count) * (2 * np.pi / count)
