@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import isfinite
 
-MOST_DECIMALS = 6
+SHORT_DECIMALS, MOST_DECIMALS = 2, 6
 
 
 def beside(value: float, limit: float, decimals: int = 0, scale: float = 1.0) -> tuple[str, str]:
@@ -17,18 +17,19 @@ def beside(value: float, limit: float, decimals: int = 0, scale: float = 1.0) ->
         scale: both are multiplied by this before they are printed, such as 100 for percent.
 
     Returns:
-        Both as text: equal texts only where the numbers are equal to six decimals.
+        Both as text; they are equal only where the numbers are, to six decimals.
 
     """
     value, limit = value * scale, limit * scale
-    wanted = f"{limit:g}" if limit == round(limit, MOST_DECIMALS) else f"{limit:.{decimals}f}"
-    if not isfinite(value) or value == limit:
-        return (wanted if value == limit else f"{value}"), wanted
+    short = f"{limit:.{SHORT_DECIMALS}f}".rstrip("0").rstrip(".")
+    short = short if float(short) == round(limit, MOST_DECIMALS) else ""
+    if not isfinite(value):
+        return f"{value}", short or f"{limit:.{decimals}f}"
     for places in range(decimals, MOST_DECIMALS + 1):
-        shown = round(value, places)
-        if shown != round(limit, places) and (shown < float(wanted)) == (value < limit):
-            return f"{value:.{places}f}", wanted
-    return f"{value:.{MOST_DECIMALS}f}", f"{limit:.{MOST_DECIMALS}f}"
+        found, wanted = f"{value:.{places}f}", short or f"{limit:.{places}f}"
+        if float(found) != float(wanted) and (float(found) < float(wanted)) == (value < limit):
+            return found, wanted
+    return found, wanted
 
 
 def percent(value: float, limit: float) -> tuple[str, str]:
@@ -37,6 +38,7 @@ def percent(value: float, limit: float) -> tuple[str, str]:
     return f"{found} %", f"{wanted} %"
 
 
-def counted(number: int, one: str, many: str | None = None) -> str:
-    """Return a number with its noun, such as "1 tie point" and "3 tie points"."""
-    return f"{number:,} {one if number == 1 else many or one + 's'}"
+def only(number: int, one: str, many: str | None = None) -> str:
+    """Return a number with its noun: "no tie points", "only 1 tie point", "only 3 tie points"."""
+    nouns = one if number == 1 else many or one + "s"
+    return f"only {number:,} {nouns}" if number else f"no {nouns}"

@@ -16,7 +16,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.types import Solution, SolveSettings, TiePoints
-from mtpcr_geo.core.wording import counted
+from mtpcr_geo.core.wording import only
 
 DEFAULTS = SolveSettings()
 
@@ -206,7 +206,7 @@ def solve_tie_points(
         held = len(source) - len(used)
         kept = f", {held} of them held out to judge by," if held else ""
         raise RegistrationError(
-            f"only {counted(len(source), 'tie point')} found{kept} and at least {least} are needed to solve "
+            f"{only(len(source), 'tie point')} found{kept} and at least {least} are needed to solve "
             "a transform from: too few places look alike in both rasters; give denser clouds or larger parts "
             "of them, or another cell or matcher (options cell, matcher)"
         )

@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core.statistics import neg_log10_p
 from mtpcr_geo.core.types import Rival, Verdict, VerdictName
-from mtpcr_geo.core.wording import beside, counted, percent
+from mtpcr_geo.core.wording import beside, only, percent
 
 Floats = NDArray[np.float64]
 
 FEWEST_GROUND_CELLS = 30
 FEWEST_HELD_OUT = 4
-FEW_CELLS_ACROSS = 48
-"""Cells across a cloud below which the patches of local matches, 12 cells at least, leave few to agree."""
 LITTLE_SHARED = 0.2
 MOST_NAMED = 3
 KEPT_SHARE = 0.5
@@ -50,7 +48,7 @@ class Evidence:
             there is no right pose; None where it was not searched.
         overlap_m2: area both clouds cover under the result, square metres.
         least_overlap_m2: the least overlap worth accepting, from both clouds' areas, square metres.
-        cell_m, extent_m: cell of the rasters, and edge of a square of the smaller cloud's area, metres.
+        missing: what keeps the rasters from giving many matches and what to do, where that is seen.
         rivals: the other hypotheses, strongest first.
         mapped: whether the target's frame has east and north.
         not_levelled: for each cloud whose vertical is not known and was not found, a sentence that says so.
@@ -81,8 +79,7 @@ class Evidence:
     refinement_lost: bool = False
     null_ratio: float | None = None
     least_overlap_m2: float = 400.0
-    cell_m: float | None = None
-    extent_m: float | None = None
+    missing: str | None = None
     rivals: tuple[Rival, ...] = ()
     mapped: bool = True
     not_levelled: tuple[str, ...] = ()
@@ -202,7 +199,7 @@ def not_checked(evidence: Evidence, name: VerdictName) -> list[str]:
     if not ground_checked(evidence):
         notes.append(
             f"not checked: the heights of the ground, which both clouds see in "
-            f"{counted(evidence.ground_cells, 'cell')} only (wanted {FEWEST_GROUND_CELLS})"
+            f"{only(evidence.ground_cells, 'cell')} (wanted {FEWEST_GROUND_CELLS})"
         )
     if name != "accepted":
         notes += [
@@ -232,7 +229,7 @@ def held_out_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
     share = evidence.held_out_agreeing / max(evidence.held_out, 1)
     if evidence.held_out < FEWEST_HELD_OUT:
         return CheckFinding(
-            f"only {counted(evidence.held_out, 'tie point')} found, too few to check the result by (wanted "
+            f"{only(evidence.held_out, 'tie point')} found, too few to check the result by (wanted "
             f"{FEWEST_HELD_OUT}); {_for_more_tie_points(evidence)}"
         )
     reached, wanted = beside(digits, limits.neg_log10_p, 1)
@@ -246,7 +243,7 @@ def held_out_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
         reached, wanted = beside(digits, limits.doubtful_neg_log10_p, 1)
         return CheckFinding(
             f"{_agreement(evidence)}, no more than chance would give (significance {reached}, refused below "
-            f"{wanted}); the clouds may show different places, or too little of the same",
+            f"{wanted}); {evidence.missing or _OTHER_PLACES}",
             refuses=True,
         )
     if digits < limits.neg_log10_p:
@@ -263,25 +260,23 @@ def held_out_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
     return None
 
 
+_OTHER_PLACES = "the clouds may show different places, or too little of the same"
+
+
 def best_neg_log10_p(evidence: Evidence) -> float:
     """Return the significance that the held-out tie points would reach if all of them agreed."""
     return neg_log10_p_of(replace(evidence, held_out_agreeing=evidence.held_out))
 
 
 def _for_more_tie_points(evidence: Evidence) -> str:
-    """Say what would give more tie points, from how the rasters are."""
-    if evidence.cell_m is not None and evidence.extent_m is not None:
-        across = evidence.extent_m / evidence.cell_m
-        if across < FEW_CELLS_ACROSS:
-            return (
-                f"the cells of {evidence.cell_m:g} m are coarse for clouds about {evidence.extent_m:.0f} m "
-                f"across ({across:.0f} cells): give denser clouds, or a finer cell (option cell)"
-            )
-        if evidence.overlap_source < LITTLE_SHARED and evidence.overlap_target < LITTLE_SHARED:
-            return (
-                f"the clouds share {evidence.overlap_m2:.0f} m2 under this result: give parts of them that "
-                "share more"
-            )
+    """Say what would give more tie points."""
+    if evidence.missing is not None:
+        return evidence.missing
+    if max(evidence.overlap_source, evidence.overlap_target) < LITTLE_SHARED:
+        return (
+            f"the clouds share {evidence.overlap_m2:.0f} m2 under this result: give parts of them that share "
+            "more"
+        )
     return "little in them stands out alike: give larger or denser clouds, or try another cell (option cell)"
 
 
@@ -292,15 +287,13 @@ def margin_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
         return None
     near = [rival for rival in evidence.rivals if rival.margin < limits.margin]
     others = "; ".join(_rival_text(rival, evidence.mapped) for rival in near[:MOST_NAMED])
+    others += "; ..." if len(near) > MOST_NAMED else ""
     what = f"another pose, {others}," if len(near) == 1 else "another pose"
     value, wanted = beside(margin, limits.margin, 2)
     if margin < 1.0:
         text = f"{what} fits better (margin {beside(margin, 1.0, 2)[0]}, wanted {wanted})"
     elif len(near) > 1:
-        text = (
-            f"{len(near)} other poses fit nearly as well (margin {value}, wanted {wanted}): {others}"
-            f"{' ...' if len(near) > MOST_NAMED else ''}"
-        )
+        text = f"{len(near)} other poses fit nearly as well (margin {value}, wanted {wanted}): {others}"
     else:
         text = f"{what} fits nearly as well (margin {value}, wanted {wanted})"
     return CheckFinding(f"{text}; {_AGAINST_RIVALS}", refuses=margin < 1.0)
@@ -324,8 +317,8 @@ def _rival_text(rival: Rival, mapped: bool) -> str:
         for value, way in zip((rival.east_m, rival.north_m), ways, strict=True)
         if abs(value) >= max(0.05, 0.1 * rival.apart_m)
     ]
-    where = " and ".join(parts) or "at the same place"
-    return f"{where} and {abs(rival.turn_deg):.0f} deg turned"
+    where = ", ".join(parts) or "at the same place"
+    return f"{where}, {abs(rival.turn_deg):.0f} deg turned"
 
 
 def refinement_findings(evidence: Evidence, limits: Limits) -> list[CheckFinding]:
@@ -351,7 +344,7 @@ def refinement_findings(evidence: Evidence, limits: Limits) -> list[CheckFinding
     if final is not None and final < KEPT_SHARE * agreed:
         found.append(
             CheckFinding(
-                f"the final transform agrees with {counted(final, 'tie point')} only, {agreed} agreed before "
+                f"the final transform agrees with {only(final, 'tie point')}, {agreed} agreed before "
                 f"(at least {KEPT_SHARE:.0%} of them are wanted): the refinement left them",
                 refuses=True,
             )
@@ -377,9 +370,10 @@ def null_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
     if evidence.null_ratio is None or evidence.null_ratio >= limits.null_ratio:
         return None
     value, wanted = beside(evidence.null_ratio, limits.null_ratio, 2)
+    how = "only" if evidence.null_ratio > 1.0 else "no better,"
     return CheckFinding(
-        f"it fits only {value} times as well as the mirrored source, which has no right pose (wanted "
-        f"{wanted}): the site is symmetric or repeats itself, or too little of it is shared"
+        f"it fits {how} {value} times as well as the mirrored source (wanted {wanted}): a scene without a "
+        "right pose does nearly as well here"
     )
 
 

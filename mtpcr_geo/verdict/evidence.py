@@ -16,6 +16,7 @@ from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.match.base import margin_of
 from mtpcr_geo.method.overlap import overlap_of
 from mtpcr_geo.method.scales import MAX_LEAST_OVERLAP_M2, ground_cell_for, scales_of, tolerance_for
+from mtpcr_geo.method.shortcomings import what_is_missing
 from mtpcr_geo.method.solve import solve_tie_points
 from mtpcr_geo.verdict.decision import Evidence
 
@@ -23,7 +24,6 @@ GROUND_AGREES_M = 0.5
 UNBOUNDED_CELLS = 2.0
 FAR_TOLERANCES, FAR_TURN_DEG = 5.0, 5.0
 """Tolerances in plan, or turn, from which on another pose is another place and not the same a little off."""
-MOST_RIVALS = 5
 TIE_POINTS_PER_PATCH = 4
 """Patches overlap by half, so about four tie points tell what one independent tie would."""
 
@@ -96,8 +96,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         null_ratio=matches.null_ratio if matches is not None else None,
         least_overlap_m2=_least_overlap_m2(pair),
         final_agreeing=int((residual < tolerance).sum()),
-        cell_m=cell,
-        extent_m=_extent_m(pair),
+        missing=_missing(pair),
         rivals=rivals_of(pair, tolerance),
         mapped=pair.frame.crs is not None,
         not_levelled=tuple(
@@ -140,7 +139,7 @@ def rivals_of(pair: Pair, tolerance: float) -> tuple[Rival, ...]:
     middle = pair.tie_points.source[:, :2].mean(axis=0)
     best = ranked[0]
     found = []
-    for other in sorted(ranked[1:], key=lambda one: -(one.strength or 0.0))[:MOST_RIVALS]:
+    for other in sorted(ranked[1:], key=lambda one: -(one.strength or 0.0)):
         east, north = _placed(other, middle) - _placed(best, middle)
         turn = float((np.degrees(other.yaw - best.yaw) + 180.0) % 360.0 - 180.0)
         far = bool(np.hypot(east, north) > FAR_TOLERANCES * tolerance or abs(turn) > FAR_TURN_DEG)
@@ -155,11 +154,11 @@ def _placed(hypothesis: Hypothesis, xy: Floats) -> Floats:
     return np.asarray(np.array([[c, -s], [s, c]]) @ xy + hypothesis.shift)
 
 
-def _extent_m(pair: Pair) -> float | None:
-    """Return the edge of a square of the smaller cloud's occupied area, metres; None without rasters."""
+def _missing(pair: Pair) -> str | None:
+    """Say what keeps the rasters from giving many matches; None where nothing is seen to."""
     if pair.source.bev is None or pair.target.bev is None:
         return None
-    return scales_of(pair.source.bev, pair.target.bev).extent_m
+    return what_is_missing(pair.source.bev, pair.target.bev)
 
 
 def _least_overlap_m2(pair: Pair) -> float:
