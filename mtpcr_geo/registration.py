@@ -194,7 +194,12 @@ class Registration:
 
         """
         stages = writers_of(Path(folder), force=force or self.force, recording=self._recording)
-        last = [tag for tag, value in self._result.values.items() if value is self.pair and value is not None]
+        taken = {stage.tag for stage in stages}
+        last = [
+            tag
+            for tag, value in self._result.values.items()
+            if value is self.pair and value is not None and tag not in taken
+        ]
         nodes = chained(stages, tuple(last[-1:]))
         self._note(run(nodes, overwrite=overwrite, progress=progress, before=self._result))
         return self.outputs
