@@ -6,6 +6,7 @@ rests on, and what a check asks beforehand.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from mtpcr_geo.core.types import Bev
@@ -18,6 +19,7 @@ FEW_CELLS_ACROSS = 4 * MIN_PATCH_CELLS
 FLAT_M = 0.1
 """Height above the surroundings that counts as noise; as in `mtpcr_geo.match.search`."""
 FLAT_SHARE = 0.99
+HOLES_WITHIN, MOSTLY_HOLES = 3, 0.1
 COARSER = 1.5
 """Times that a cell exceeds what the density bears, from which on a finer one is worth trying."""
 
@@ -30,6 +32,11 @@ def what_is_missing(source: Bev, target: Bev) -> str | None:
 
     """
     for role, bev in (("source", source), ("target", target)):
+        if is_mostly_holes(bev):
+            return (
+                f"only {filled_share(bev):.1%} of the {role}'s cells of {bev.grid.cell:g} m hold points where "
+                "it lies: give it unthinned, or a coarser cell (option cell)"
+            )
         if is_flat(bev):
             return (
                 f"the {role} is flat ({FLAT_SHARE:.0%} of its cells lie within {relief_m(bev):.2f} m of "
@@ -65,12 +72,24 @@ def cells_short(cell_m: float, extent_m: float, role: str, per_m2: float) -> str
         return f"{size}, and the points bear cells of {borne:.2g} m: give a finer cell (option cell)"
     if cell_m > FINEST_AUTO_CELL_M:
         return f"{size}, and the points ({per_m2:.2g} per m2) bear none finer: give denser or larger clouds"
-    return f"{size}, the finest: give a larger part of the place"
+    return f"{size} (the finest): give a larger part of the place"
 
 
 def is_flat(bev: Bev) -> bool:
     """Return whether nothing in a raster stands out from its surroundings by more than noise."""
-    return relief_m(bev) < FLAT_M
+    return not is_mostly_holes(bev) and relief_m(bev) < FLAT_M
+
+
+def is_mostly_holes(bev: Bev) -> bool:
+    """Return whether so few cells hold points that no shape is seen, nor whether there is one."""
+    return filled_share(bev) < MOSTLY_HOLES
+
+
+def filled_share(bev: Bev) -> float:
+    """Return the share of cells that hold points, of those within three cells of any that does."""
+    filled = (bev.count > 0).astype(np.uint8)
+    around = cv2.dilate(filled, np.ones((2 * HOLES_WITHIN + 1,) * 2, np.uint8))
+    return float(filled.sum()) / max(float(around.sum()), 1.0)
 
 
 def relief_m(bev: Bev) -> float:

@@ -100,7 +100,7 @@ def test_saving_with_force_what_was_withheld_before(tmp_path):
 
 def test_a_registration_that_was_written_can_be_saved_again(town_files, tmp_path, monkeypatch):
     monkeypatch.setattr("mtpcr_geo.verdict.decision.assess", lambda *a, **k: CASES["ambiguous"][0])
-    found = register(*town_files, tmp_path / "first", recording=False)
+    found = register(town_files[0], town_files[1], tmp_path / "first", recording=False)
     assert set(found.not_written) == {"registered"}
     found.save(tmp_path / "second", force=True)
     assert (tmp_path / "second" / "registered.laz").exists()
@@ -110,7 +110,7 @@ def test_a_registration_that_was_written_can_be_saved_again(town_files, tmp_path
 
 def test_a_pipeline_names_its_own_way_to_force(town_files, tmp_path, monkeypatch):
     monkeypatch.setattr("mtpcr_geo.verdict.decision.assess", lambda *a, **k: CASES["refused"][0])
-    stages = build_pipeline(*town_files, tmp_path / "out", RegisterOptions(recording=False))
+    stages = build_pipeline(town_files[0], town_files[1], tmp_path / "out", RegisterOptions(recording=False))
     result = execute(grammar.link(grammar.parse(grammar.dump(stages))))
     text = io.StringIO()
     print_run(result, console=Console(file=text, width=400, highlight=False))
@@ -129,7 +129,7 @@ def test_no_transform_is_given_as_the_reason_where_none_was_found(town_files, tm
         raise RegistrationError("nothing looks alike; give other clouds")
 
     monkeypatch.setattr("mtpcr_geo.match.correlation.match", nothing)
-    found = register(*town_files, tmp_path / "out", recording=False, force=True)
+    found = register(town_files[0], town_files[1], tmp_path / "out", recording=False, force=True)
     assert found.not_written["registered"] == found.not_written["transform"] == "no transform was found"
     assert not found.forced
     assert "--force" not in terminal(found)
