@@ -34,8 +34,8 @@ def what_is_missing(source: Bev, target: Bev) -> str | None:
     for role, bev in (("source", source), ("target", target)):
         if is_mostly_holes(bev):
             return (
-                f"only {filled_share(bev):.1%} of the {role}'s cells of {bev.grid.cell:g} m hold points where "
-                "it lies: give it unthinned, or a coarser cell (option cell)"
+                f"only {filled_share(bev):.1%} of the {role}'s cells of {bev.grid.cell:g} m hold points: "
+                "give it unthinned, or a coarser cell (option cell)"
             )
         if is_flat(bev):
             return (

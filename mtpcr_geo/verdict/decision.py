@@ -370,11 +370,11 @@ def null_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
     if evidence.null_ratio is None or evidence.null_ratio >= limits.null_ratio:
         return None
     value, wanted = beside(evidence.null_ratio, limits.null_ratio, 2)
-    how = "only" if evidence.null_ratio > 1.0 else "no better,"
-    return CheckFinding(
-        f"it fits {how} {value} times as well as the mirrored source (wanted {wanted}): a scene without a "
-        "right pose does nearly as well here"
-    )
+    mirrored = "the mirrored source, which has no right pose"
+    text = f"it fits only {value} times as well as {mirrored} (wanted {wanted})"
+    if evidence.null_ratio < 1.0:
+        text = f"it fits less well than {mirrored} ({value} times, wanted {wanted})"
+    return CheckFinding(f"{text}; the pose is no surer than chance makes one: look at it before use")
 
 
 def overlap_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
