@@ -178,6 +178,22 @@ def read_transform(path: str | Path) -> TransformChain:
     return result
 
 
+def doubts_of(path: str | Path) -> str | None:
+    """Return a sentence if a ``transform.json`` says that its verdict is not accepted; None if not.
+
+    Args:
+        path: the file, which `read_transform` takes.
+
+    """
+    stated = json.loads(Path(path).read_text(encoding="utf-8")).get("verdict")
+    if not isinstance(stated, dict) or stated.get("name") in (None, "accepted"):
+        return None
+    reasons = stated.get("reasons")
+    why = f": {reasons[0]}" if isinstance(reasons, list) and reasons else ""
+    forced = " and its files were forced" if stated.get("forced") else ""
+    return f"the verdict on this transform is {stated['name']}{forced}{why}"
+
+
 def frames_of(pair: Pair) -> dict[str, Any]:
     """Return the CRSs and units of source, target and result, and how each comes to the work frame."""
     links = {"source": pair.source.link, "target": pair.target.link}

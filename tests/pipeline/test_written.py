@@ -133,3 +133,17 @@ def test_no_transform_is_given_as_the_reason_where_none_was_found(town_files, tm
     assert found.not_written["registered"] == found.not_written["transform"] == "no transform was found"
     assert not found.forced
     assert "--force" not in terminal(found)
+
+
+def test_applying_a_transform_that_was_not_accepted_warns(tmp_path):
+    from mtpcr_geo.export.transform import doubts_of
+
+    said = {}
+    for case in ("accepted", "ambiguous", "refused"):
+        judged(CASES[case][0]).save(tmp_path / case, force=True)
+        said[case] = doubts_of(tmp_path / case / "transform.json")
+    assert said == {
+        "accepted": None,
+        "ambiguous": "the verdict on this transform is doubtful and its files were forced: margin",
+        "refused": "the verdict on this transform is refused and its files were forced: no",
+    }
