@@ -5,8 +5,9 @@ for a name: a stage's tag, a role (source, target, result, work), a library.
 
 - ``verdict``: accepted, doubtful or refused; null where the run ended before a verdict
 - ``reasons``: why: one sentence each
-- ``rivals[].east_m``: where another pose that fits nearly as well puts the middle of the tie points, from
-  where the pose found does; those with a margin below the limit, strongest first; none where accepted
+- ``rivals``: other poses that fit nearly as well, with a margin below the limit, strongest first; empty where
+  there are none, and where the verdict is accepted
+- ``rivals[].east_m``: where one puts the middle of the tie points, from where the pose found does
 - ``rivals[].north_m``: likewise
 - ``rivals[].turn_deg``: by how much it is turned against the pose found, counter-clockwise
 - ``rivals[].margin``: strength of the pose found over its own
@@ -32,6 +33,7 @@ for a name: a stage's tag, a role (source, target, result, work), a library.
 - ``inputs[].bytes``: its size
 - ``inputs[].sha256``: its hash
 - ``outputs``: files written before this one
+- ``not_written``: files that were not written; empty where all were
 - ``not_written[].path``: each file that was not written
 - ``not_written[].why``: why not
 - ``forced``: whether files were written that the verdict withholds
