@@ -49,6 +49,8 @@ class Registration:
         pair: the whole state, from levelled clouds to tie points; None where not even a pair was made.
         report: the finished stages, with their options, metadata and seconds.
         outputs: the files written, by what they are.
+        not_written: why files were not written, by what they are.
+        forced: whether files were written that the verdict withholds.
         force: whether a refused result may be used.
 
     """
@@ -66,7 +68,11 @@ class Registration:
         self.force = force
         self._result = result
         self._recording = recording
-        self.outputs = _by_name(result.outputs if recording is None else ())
+        self.outputs: dict[str, Path] = {}
+        self.not_written: dict[str, str] = {}
+        self.forced = False
+        if recording is None:
+            self._note(result)
         if recording is not None:
             weakref.finalize(self, shutil.rmtree, recording.parent, ignore_errors=True)
 
@@ -171,12 +177,12 @@ class Registration:
 
         Input files are read again for the registered cloud and their hashes; arrays must not have been
         changed since. The recording is among the files where `register` was called with recording=True.
-        A refused registration leaves its evidence only.
+        A refused registration leaves its evidence only, and a doubtful one with a rival far away no cloud.
 
         Args:
             folder: made if it is not there.
             overwrite: replace files that are already there.
-            force: write cloud and transform even if the verdict is refused.
+            force: write cloud and transform even if the verdict withholds them.
             progress: receives the progress of long steps.
 
         Returns:
@@ -188,12 +194,24 @@ class Registration:
 
         """
         stages = writers_of(Path(folder), force=force or self.force, recording=self._recording)
-        last = [tag for tag, value in self._result.values.items() if value is self.pair and value is not None]
+        taken = {stage.tag for stage in stages}
+        last = [
+            tag
+            for tag, value in self._result.values.items()
+            if value is self.pair and value is not None and tag not in taken
+        ]
         nodes = chained(stages, tuple(last[-1:]))
-        self.outputs = _by_name(
-            run(nodes, overwrite=overwrite, progress=progress, before=self._result).outputs
-        )
+        self._note(run(nodes, overwrite=overwrite, progress=progress, before=self._result))
         return self.outputs
+
+    def _note(self, result: RunResult) -> None:
+        """Keep what a run wrote and withheld."""
+        written = result.written
+        self.outputs = _by_name(written.files)
+        self.not_written = {
+            name: written.withheld[path] for name, path in _by_name(tuple(written.withheld)).items()
+        }
+        self.forced = written.forced
 
     def __repr__(self) -> str:
         rows = self._rows()

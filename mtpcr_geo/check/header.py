@@ -22,7 +22,7 @@ FINEST_SCALE_M = 0.0001
 COARSEST_SCALE_M = 0.1
 FULLEST_RANGE = 0.5  # share of the 32 bit integers that coordinates may use before a shift can overflow
 FAR_OFFSET_M = 10_000.0
-ROOMY_RANGE = 0.05  # below this share an offset far away does no harm
+ROOMY_RANGE = 0.4  # below this share an offset far away does no harm
 SECONDS_A_WEEK = 604_800.0
 _WKT_BIT, _STANDARD_TIME_BIT = 16, 1
 

@@ -11,7 +11,9 @@ import numpy as np
 from mtpcr_geo.check.findings import Finding
 from mtpcr_geo.check.place import EXCHANGE, area_findings, exchanged, within_area
 from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.wording import beside
 from mtpcr_geo.crs.resolve import FARTHEST_APART
+from mtpcr_geo.method.scales import LEAST_OVERLAP_SHARE, MAX_LEAST_OVERLAP_M2
 
 if TYPE_CHECKING:
     from mtpcr_geo.check.inspection import Inspection
@@ -20,7 +22,6 @@ if TYPE_CHECKING:
 
 
 MOST_CELLS = 4_000_000
-LITTLE_OVERLAP_M2 = 400.0
 FEET_A_METRE = 1.0 / 0.3048
 FEWEST_CELLS = 50
 DATUM_STEP_M, SMALL_STEP_M = 10.0, 2.0
@@ -120,8 +121,15 @@ def _area(xyz: Floats, cell: float) -> float:
     return float(len(np.unique(cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]))) * cell**2
 
 
-def relation_findings(relation: Relation) -> Iterator[Finding]:
-    """Yield what keeps clouds from being registered by where they lie: a gap, or little overlap."""
+def relation_findings(relation: Relation, smaller_m2: float) -> Iterator[Finding]:
+    """Yield what keeps clouds from being registered by where they lie: a gap, or little overlap.
+
+    Args:
+        relation: where they lie.
+        smaller_m2: area of the smaller cloud, square metres.
+
+    """
+    least = min(LEAST_OVERLAP_SHARE * smaller_m2, MAX_LEAST_OVERLAP_M2)
     if relation.name == "apart" and relation.distance_m:
         yield Finding(
             "warning",
@@ -131,14 +139,14 @@ def relation_findings(relation: Relation) -> Iterator[Finding]:
             "check that they show the same place; registering searches at any distance, but a wrong CRS "
             "also bends and scales",
         )
-    elif relation.name == "overlapping" and (relation.overlap_m2 or 0.0) < LITTLE_OVERLAP_M2:
+    elif relation.name == "overlapping" and (relation.overlap_m2 or 0.0) < least:
+        shared, wanted = beside(relation.overlap_m2 or 0.0, least)
         yield Finding(
-            "note",
+            "warning",
             "little-overlap",
             "both",
-            f"by their CRSs they share {relation.overlap_m2:.0f} square metres only, which would be too "
-            "little to register by",
-            "give larger parts of them",
+            f"by their CRSs they share {shared} square metres only, and a registration wants {wanted}",
+            "give parts of them that share more",
         )
 
 
@@ -240,6 +248,18 @@ def link_findings(source: FrameLink, target: FrameLink) -> Iterator[Finding]:
         )
     for note in report.height_notes:
         yield Finding("note", "vertical-taken", "both", note)
+
+
+def result_findings(source: Inspection, target: Inspection) -> Iterator[Finding]:
+    """Yield that a result has no CRS, where the target has none and the source does."""
+    if target.is_local and source.claim.facts is not None and not source.is_local:
+        yield Finding(
+            "note",
+            "target-local",
+            "target",
+            "it is local, so that the result has local coordinates and no CRS, though the source has one",
+            "exchange the two clouds, if the result shall be in the source's CRS",
+        )
 
 
 def swapped_findings(source: Inspection, target: Inspection) -> Iterator[Finding]:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 # grids are used a little beyond their area, and neighbouring zones for one another; they do not break there
 BEYOND_AREA_DEG, NEIGHBOUR_DEG = 0.5, 6.0
+NEAR_ORIGIN_M = 10_000.0
 EXCHANGE = "exchange them, for example with PDAL's filters.ferry, or name the CRS that has them so"
 _COORDINATE_EPOCH = re.compile(r"COORDINATEMETADATA\b.*[,\s]EPOCH\s*\[\s*([0-9.]+)\s*\]", re.S | re.I)
 
@@ -134,7 +135,7 @@ def claim_findings(
                 "note",
                 "crs-overridden",
                 role,
-                f"the file states {cloud.crs.name}; {claim.facts.name} is used instead, as given by option",
+                f"the file states {cloud.crs.name}; it is taken as {claim.facts.name}, as given by option",
             )
     epoch, frame = epochs_of(cloud, claim.facts)
     if frame is not None and epoch is None:
@@ -162,9 +163,13 @@ def _guess(cloud: LasCloud) -> str:
     low, high = cloud.minimum, cloud.maximum
     if not np.isfinite(low + high).all():
         return ""
-    if np.abs([low[0], high[0]]).max() <= 180 and np.abs([low[1], high[1]]).max() <= 90:
-        if np.ptp([low[:2], high[:2]], axis=0).max() < 1.0 < np.abs(low[:2]).max():
+    plan = np.array([low[:2], high[:2]])
+    if np.abs(plan[:, 0]).max() <= 180 and np.abs(plan[:, 1]).max() <= 90:
+        if np.ptp(plan, axis=0).max() < 1.0 < np.abs(low[:2]).max():
             return "; its x and y look like degrees"
+        return "; its x and y look local"
+    # origins of grids lie far outside of what they map
+    if np.abs(plan).max() < NEAR_ORIGIN_M or (plan[0] * plan[1] <= 0).all():
         return "; its x and y look local"
     if np.linalg.norm(low) > 6.2e6 and np.ptp([low, high], axis=0).max() < 1e5 and np.abs(low[2]) > 1e5:
         return "; its coordinates look geocentric"

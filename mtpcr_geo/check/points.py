@@ -17,10 +17,11 @@ if TYPE_CHECKING:
     from mtpcr_geo.io.sample import Scan
 
 
-SPARSE_PER_M2, VERY_SPARSE_PER_M2 = 0.5, 0.1
-FEW_POINTS = 10_000
 MUCH_NOISE, VERY_MUCH_NOISE = 0.05, 0.3
+PROBED, PILED = 20_000, 0.01
 TALLEST_M = 1500.0
+TALLEST_GROWN_OR_BUILT_M = 120.0
+"""Trees grow no higher, and few buildings: a plot may well be narrower than what stands on it is high."""
 LOWEST_LAND_M, HIGHEST_LAND_M = -500.0, 9000.0
 
 
@@ -117,25 +118,20 @@ def noise_findings(scan: Scan, role: Role) -> Iterator[Finding]:
         )
 
 
-def density_findings(measured: Measured, count: int, role: Role) -> Iterator[Finding]:
-    """Yield whether points are too few or too sparse to show shapes."""
-    if measured.per_m2 < SPARSE_PER_M2:
-        very = measured.per_m2 < VERY_SPARSE_PER_M2
+def piled_findings(scan: Scan, role: Role) -> Iterator[Finding]:
+    """Yield whether many points lie at one place: scanners write zeros where nothing returned."""
+    few = scan.sample[:: max(1, len(scan.sample) // PROBED)]
+    places, counts = np.unique(few, axis=0, return_counts=True)
+    most = int(counts.argmax())
+    share = float(counts[most]) / len(few)
+    if share > PILED:
+        place = ", ".join(f"{value + 0.0:g}" for value in places[most])
         yield Finding(
-            "warning" if very else "note",
-            "sparse",
+            "warning",
+            "piled",
             role,
-            f"it has {measured.per_m2:.2g} points a square metre where it has any: cells will be coarse"
-            + (", and the result may be" if very else ""),
-            "give the cloud unthinned, if there is one",
-        )
-    if count < FEW_POINTS:
-        yield Finding(
-            "note",
-            "few-points",
-            role,
-            f"it has {count:,} points only",
-            "give the cloud unthinned or a larger part of it, if there is one",
+            f"{share:.0%} of its points lie at one and the same place ({place}), as where nothing returned",
+            "remove them: filters.crop in a pipeline does it, or export the cloud without them",
         )
 
 
@@ -172,7 +168,9 @@ def height_findings(measured: Measured, unit_name: str, stated: bool, role: Role
             f"between {low:.0f} and {high:.0f} m",
             "classify them as noise (7 or 18), or crop them",
         )
-    elif highest - lowest > TALLEST_M or body > float(measured.extent[:2].max()):
+    elif highest - lowest > TALLEST_M or body > max(
+        float(measured.extent[:2].max()), TALLEST_GROWN_OR_BUILT_M
+    ):
         yield Finding(
             "warning",
             "z-range",

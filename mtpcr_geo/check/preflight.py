@@ -10,17 +10,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mtpcr_geo.check import header, pair, place, points
+from mtpcr_geo.check import fitness, header, pair, place, points
 from mtpcr_geo.check.describe import CloudFacts, describe
 from mtpcr_geo.check.findings import CloudRole, Finding, Role, by_severity, finding_of
 from mtpcr_geo.check.inspection import Inspection
+from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError, InputError, MtpcrError, OptionError, RegistrationError
 from mtpcr_geo.core.frames import box_points
 from mtpcr_geo.crs import FrameLink, WorkFrame, resolve_frames
 from mtpcr_geo.crs.near import check_reach, distance_to_box, place_in_work, rim_of
 from mtpcr_geo.io.las import check_distinct, open_cloud
 from mtpcr_geo.io.sample import Scan, scan
-from mtpcr_geo.method.bev import choose_cell, coverage_of, grid_around
+from mtpcr_geo.method.bev import coverage_of, grid_around
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.progress import Progress
@@ -143,6 +144,7 @@ class _Check:
         self.findings: list[Finding] = []
         self.refusals: list[MtpcrError] = []
         self.relation: pair.Relation | None = None
+        self.common: tuple[Floats, Floats] | None = None
 
     @contextmanager
     def stopping(self, code: str, role: Role) -> Iterator[None]:
@@ -174,6 +176,7 @@ class _Check:
         if inspection.scan is None:
             return
         found += points.noise_findings(inspection.scan, role)
+        found += points.piled_findings(inspection.scan, role)
         try:
             _, link, _ = resolve_frames(cloud, cloud, target_crs=declared, source_crs=declared, local=local)
             sample = link.to_work(inspection.scan.sample)
@@ -190,7 +193,6 @@ class _Check:
         inspection.measured = points.Measured(
             sample, low, high, float(link.origin[2]), dense.per_m2, dense.occupied_m2
         )
-        found += points.density_findings(inspection.measured, cloud.count, role)
         found += points.plan_findings(inspection.measured, role)
         if claim.facts is not None and claim.facts.kind != "geocentric":
             stated = claim.facts.georeferenced
@@ -237,6 +239,7 @@ class _Check:
             self.relation = pair.by_area(source, target)
         if self.relation.name != "overlapping":
             self.findings += pair.swapped_findings(source, target)
+        self.findings += pair.result_findings(source, target)
         self.findings += pair.same_points_findings(source, target)
         return frames
 
@@ -287,7 +290,10 @@ class _Check:
             return
         overlap: Overlap | None
         self.relation, overlap = pair.relate(samples[0] + (to_source.origin - to_target.origin), samples[1])
-        self.findings += pair.relation_findings(self.relation)
+        areas = [one.measured.area_m2 for one in (source, target) if one.measured is not None]
+        self.findings += pair.relation_findings(self.relation, min(areas, default=np.inf))
+        if self.relation.name == "overlapping":
+            self.common = samples[0] + (to_source.origin - to_target.origin), samples[1]
         if overlap is not None:
             self.findings += pair.height_pair_findings(overlap, float(to_target.origin[2]))
 
@@ -303,10 +309,18 @@ class _Check:
         ]
         if self.refusals or not sides:
             return
-        cell = choose_cell([measured.per_m2 for _, measured in sides], finest=1.0)
+        clouds = [
+            fitness.Fitness(one.role, measured, one.cloud.count, one.is_local) for one, measured in sides
+        ]
+        cell = fitness.cell_for(clouds)
         for inspection, measured in sides:
             with self.stopping("raster-size", inspection.role):
                 grid_around(measured.low, measured.high, cell)
+        if not self.refusals:
+            self.findings += fitness.fitness_findings(clouds)
+            if self.common is not None:
+                thinned = max(cloud.thinned for cloud in clouds)
+                self.findings += fitness.ground_findings(*self.common, cell * thinned)
 
     def report(self) -> CheckReport:
         """Put together what was found."""

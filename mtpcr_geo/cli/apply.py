@@ -10,14 +10,16 @@ from mtpcr_geo.cli.shared import progress_bars
 
 
 def run(options: ApplyVerb) -> None:
-    """Move a cloud by the transform of a registration, streamed.
+    """Move a cloud by the transform of a registration, streamed; warn where that was not accepted.
 
     Examples:
         mtpcr-geo apply out/transform.json another_scan.laz moved.laz
         mtpcr-geo apply out/transform.json moved.laz back.laz --inverse
 
     """
+    from mtpcr_geo.core.errors import one_line
     from mtpcr_geo.export.apply import apply_transform
+    from mtpcr_geo.export.transform import doubts_of
 
     with progress_bars(options.quiet) as progress:
         written = apply_transform(
@@ -28,6 +30,9 @@ def run(options: ApplyVerb) -> None:
             overwrite=options.overwrite,
             progress=progress,
         )
+    doubts = doubts_of(options.transform)
+    if doubts is not None:
+        typer.echo(one_line(f"mtpcr-geo: warning: {doubts}"), err=True)
     if not options.quiet:
         typer.echo(f"wrote {written}")
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from mtpcr_geo.registration import Registration
 
 _COLOUR = {"accepted": "bold green", "doubtful": "bold yellow", "refused": "bold red"}
+_RESULT_FILES = {"registered": "the registered cloud", "transform": "the transform"}
 # metrics of the verdict shown without --verbose
 _SHOWN = (
     "vertical_offset_m",
@@ -40,7 +41,12 @@ _OPEN_WITH = {
 
 
 def print_registration(
-    result: Registration, *, verbose: bool = False, files: bool = True, console: Console | None = None
+    result: Registration,
+    *,
+    verbose: bool = False,
+    files: bool = True,
+    console: Console | None = None,
+    force_with: str = "--force writes it all the same",
 ) -> None:
     """Print verdict, reasons, the transform in words, the checks, and which files to open.
 
@@ -49,6 +55,7 @@ def print_registration(
         verbose: all metrics of the verdict; and, on standard error, the seconds of each stage.
         files: name the files to open.
         console: where to print; standard output if not given.
+        force_with: how to have what the verdict withholds written.
 
     """
     from rich.table import Table
@@ -68,8 +75,8 @@ def print_registration(
         _print_stages(result.report)
     for path, what in _to_open(result).items() if files else ():
         console.print(Text(f"  {path}"), Text(what, "dim"), soft_wrap=True)
-    if name == "refused" and "registered" not in result.outputs:
-        console.print(Text("  no registered cloud was written; --force writes it all the same", "dim"))
+    for line in _withheld_lines(result, force_with):
+        console.print(Text(f"  {line}", "dim"), soft_wrap=True)
 
 
 def print_run(result: RunResult, *, verbose: bool = False, console: Console | None = None) -> None:
@@ -80,13 +87,31 @@ def print_run(result: RunResult, *, verbose: bool = False, console: Console | No
     named: set[Path] = set()
     if result.verdict is not None:
         registration = registration_of(result)
-        print_registration(registration, verbose=verbose, console=console)
+        force_with = "force of mtpcr.apply and mtpcr.write_transform writes it all the same"
+        print_registration(registration, verbose=verbose, console=console, force_with=force_with)
         named = set(_to_open(registration))
     elif verbose:
         _print_stages(result.done)
     for path in result.outputs:
         if path not in named:
             console.print(f"  wrote {path}", soft_wrap=True, markup=False)
+
+
+def _withheld_lines(result: Registration, force_with: str) -> list[str]:
+    """Say which files of the result were not written and why, or that they were forced."""
+    if result.forced:
+        verdict = result.verdict
+        kept_back = {"registered": verdict.withholds_cloud, "transform": verdict.withholds_transform}
+        forced = [key for key, why in kept_back.items() if why is not None and key in result.outputs]
+        what = " and ".join(_RESULT_FILES[key] for key in forced)
+        return [f"written though {verdict.withholds_cloud}, since that was forced: {what or 'the result'}"]
+    missing = [key for key in _RESULT_FILES if key in result.not_written]
+    if not missing:
+        return []
+    what = " and ".join(_RESULT_FILES[key] for key in missing)
+    possible = result.T_target_source is not None
+    hint = f"; {force_with}" if possible else ""
+    return [f"not written: {what}, since {result.not_written[missing[0]]}{hint}"]
 
 
 def _stdout() -> Console:

@@ -152,6 +152,7 @@ class Hypothesis:
         shift: (2,) metres.
         score: the score by which hypotheses are ranked; higher is better.
         overlap_cells: cells that both images fill under this pose.
+        strength: what the margin between hypotheses is taken of; None where a matcher has none.
 
     """
 
@@ -159,6 +160,7 @@ class Hypothesis:
     shift: tuple[float, float]
     score: float
     overlap_cells: int = 0
+    strength: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,19 +229,58 @@ class TiePoints(ComparesArrays):
 
 
 @dataclass(frozen=True)
+class Rival:
+    """Another pose that fits nearly as well as the one found.
+
+    Attributes:
+        east_m, north_m: where it puts the middle of the tie points, from where the pose found does, metres.
+        turn_deg: by how much it is turned against the pose found, -180 to 180 degrees, counter-clockwise.
+        margin: strength of the pose found over its own.
+        far: whether it is another place, and not the same a little off.
+
+    """
+
+    east_m: float
+    north_m: float
+    turn_deg: float
+    margin: float
+    far: bool
+
+    @property
+    def apart_m(self) -> float:
+        """Distance in plan, metres."""
+        return float(np.hypot(self.east_m, self.north_m))
+
+
+@dataclass(frozen=True)
 class Verdict:
     """The judgement of a run.
 
     Attributes:
         name: "accepted", "doubtful" or "refused".
-        reasons: one sentence each: why it is not accepted, or what the acceptance rests on.
+        reasons: one sentence each: why it is not accepted, or what the acceptance rests on; then what could
+            not be checked.
         metrics: the numbers behind it, with units in their names.
+        rivals: other poses that fit nearly as well, the strongest first.
 
     """
 
     name: VerdictName
     reasons: tuple[str, ...]
     metrics: dict[str, Any]
+    rivals: tuple[Rival, ...] = ()
+
+    @property
+    def withholds_transform(self) -> str | None:
+        """Why the transform files are written only if forced; None where they are written."""
+        return "the verdict is refused" if self.name == "refused" else None
+
+    @property
+    def withholds_cloud(self) -> str | None:
+        """Why the registered cloud is written only if forced; None where it is written."""
+        if self.name == "doubtful" and any(rival.far for rival in self.rivals):
+            return "another pose, far from this one, fits nearly as well"
+        return self.withholds_transform
 
 
 @dataclass(frozen=True, eq=False)

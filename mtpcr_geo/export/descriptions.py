@@ -21,7 +21,7 @@ Row = tuple[str, str]
 _MEANING = {
     "accepted": "The source fits the target; the checks that did not take part in the fit agree.",
     "doubtful": "A transform was found, but the checks leave room for doubt: inspect it before use.",
-    "refused": "The checks speak against the transform; no registered cloud is written unless forced.",
+    "refused": "The checks speak against the transform, or none was found.",
 }
 _LABELS = {
     "held_out_tie_points": "held-out tie points",
@@ -37,6 +37,7 @@ _LABELS = {
     "overlap_target": "overlap, share of the target",
     "ground_cells": "ground that both see, cells compared",
     "ground_agreeing": "of these, cells with heights within 0.5 m",
+    "ground_checked": "enough ground to judge by",
     "refined_away_m": "moved by the refinement",
     "vertical_offset_m": "height offset found",
     "yaw_deg": "yaw, work frame",
@@ -54,6 +55,24 @@ _SHARES = ("_share", "overlap_source", "overlap_target", "_support")
 def verdict_meaning(verdict: Verdict) -> str:
     """Return in a sentence what a verdict means for the user."""
     return _MEANING[verdict.name]
+
+
+def written_text(written: Mapping[str, Any]) -> str:
+    """Return in a sentence which files a run wrote, and which not and why, by their names.
+
+    Args:
+        written: files (paths), withheld (path, why) and forced, as in run.json.
+
+    """
+    files = ", ".join(Path(path).name for path in written["files"])
+    parts = [f"Written: {files or 'nothing'}."]
+    by_reason: dict[str, list[str]] = {}
+    for one in written["withheld"]:
+        by_reason.setdefault(one["why"], []).append(Path(one["path"]).name)
+    parts += [f"Not written: {', '.join(names)}, since {why}." for why, names in by_reason.items()]
+    if written["forced"]:
+        parts.append("Files that the verdict withholds were written since that was forced.")
+    return " ".join(parts)
 
 
 def metric_rows(metrics: Mapping[str, Any]) -> list[Row]:

@@ -5,6 +5,14 @@ for a name: a stage's tag, a role (source, target, result, work), a library.
 
 - ``verdict``: accepted, doubtful or refused; null where the run ended before a verdict
 - ``reasons``: why: one sentence each
+- ``rivals``: other poses that fit nearly as well, with a margin below the limit, strongest first; empty where
+  there are none, and where the verdict is accepted
+- ``rivals[].east_m``: where one puts the middle of the tie points, from where the pose found does
+- ``rivals[].north_m``: likewise
+- ``rivals[].turn_deg``: by how much it is turned against the pose found, counter-clockwise
+- ``rivals[].margin``: strength of the pose found over its own
+- ``rivals[].far``: whether it is another place, and not the same a little off: then a doubtful run writes no
+  registered cloud unless forced
 - ``metrics``: what the verdict rests on, see below; empty where the run failed before
 - ``T_target_source``: 4x4 on coordinates as they stand in the files, source to target; null if not found
 - ``frames``: CRS and units of source, target and result, and the work frame; null without a pair
@@ -17,7 +25,7 @@ for a name: a stage's tag, a role (source, target, result, work), a library.
 - ``stages[].options``: its options, as above
 - ``stages[].seconds``: its time
 - ``stages[].metadata``: its own figures, see below
-- ``stages[].skipped``: why it did not run, where it did not
+- ``stages[].skipped``: why it did not run or made nothing, where it did not
 - ``stages[].failed``: why the registration ended there, where it did
 - ``pipeline``: the pipeline JSON that was run
 - ``versions.<library>``: version of this package, of Python and of the libraries installed
@@ -25,6 +33,10 @@ for a name: a stage's tag, a role (source, target, result, work), a library.
 - ``inputs[].bytes``: its size
 - ``inputs[].sha256``: its hash
 - ``outputs``: files written before this one
+- ``not_written``: files that were not written; empty where all were
+- ``not_written[].path``: each file that was not written
+- ``not_written[].why``: why not
+- ``forced``: whether files were written that the verdict withholds
 
 The frames; ``result`` is that of the registered cloud:
 
@@ -61,6 +73,7 @@ The metrics:
 - ``metrics.overlap_target``: the same as a share of the target's ground, 0 to 1
 - ``metrics.ground_cells``: cells in which both see the ground
 - ``metrics.ground_agreeing``: of these, cells whose heights agree within 0.5 m
+- ``metrics.ground_checked``: whether there are enough of them to judge by
 - ``metrics.refined_away_m``: how far the refinement moved the middle of the source
 - ``metrics.vertical_offset_m``: metres added to the source's heights, with vertical: estimate
 - ``metrics.yaw_deg``: yaw of the transform in the work frame, counter-clockwise from above
@@ -199,8 +212,6 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.assess surface_residual``: how badly flat surfaces meet under the result and under the prior: 0 all
   meet, 1 none does; null where there are too few
 - ``mtpcr.assess prior_kept``: whether the prior was kept
-- ``mtpcr.apply skipped``: why no cloud was made, where none was
-- ``mtpcr.write_<what> skipped``: why nothing was written, where nothing was
 - ``writers.las filename``: the file
 - ``writers.las count``: points written
 """

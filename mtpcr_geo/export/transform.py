@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -26,12 +27,18 @@ _SHARED_SHIFT = 10_000.0  # beyond this, single precision would show in one comm
 _EARTH_RADIUS = 6_371_000.0
 
 
-def write_transform_json(path: str | Path, pair: Pair) -> None:
+def write_transform_json(path: str | Path, pair: Pair, *, forced: bool = False) -> None:
     """Write ``transform.json``: the transform in every form, and all that applying it needs.
 
     ``T_target_source`` acts on coordinates as they stand in the files. Where no 4x4 can do that exactly
     (a map projection lies between), it is the best fit, and ``exactness`` says by how much it is off;
-    ``chain`` is exact always.
+    ``chain`` is exact always. ``verdict`` says whether the transform may be believed.
+
+    Args:
+        path: file to write.
+        pair: with a transform.
+        forced: whether files of the run are written that the verdict withholds.
+
     """
     chain = TransformChain.of(pair)
     work = pair.frame.crs
@@ -43,6 +50,7 @@ def write_transform_json(path: str | Path, pair: Pair) -> None:
         "version": VERSION,
         "T_target_source": T,
         "T_source_target": np.linalg.inv(T) if not _is_rigid(T) else transforms.inverse(T),
+        "verdict": _verdict(pair, forced),
         "frame": "coordinates as they stand in the files: T takes those of the source to the target's",
         "exactness": {
             "exact": chain.is_affine,
@@ -170,6 +178,22 @@ def read_transform(path: str | Path) -> TransformChain:
     return result
 
 
+def doubts_of(path: str | Path) -> str | None:
+    """Return a sentence if a ``transform.json`` says that its verdict is not accepted; None if not.
+
+    Args:
+        path: the file, which `read_transform` takes.
+
+    """
+    stated = json.loads(Path(path).read_text(encoding="utf-8")).get("verdict")
+    if not isinstance(stated, dict) or stated.get("name") in (None, "accepted"):
+        return None
+    reasons = stated.get("reasons")
+    why = f": {reasons[0]}" if isinstance(reasons, list) and reasons else ""
+    forced = " and its files were forced" if stated.get("forced") else ""
+    return f"the verdict on this transform is {stated['name']}{forced}{why}"
+
+
 def frames_of(pair: Pair) -> dict[str, Any]:
     """Return the CRSs and units of source, target and result, and how each comes to the work frame."""
     links = {"source": pair.source.link, "target": pair.target.link}
@@ -210,6 +234,17 @@ def dumps(value: Any, indent: int = 0) -> str:
         # a number that looks like an integer would be read back as one
         return text if any(mark in text for mark in ".e") else text + ".0"
     return json.dumps(value)
+
+
+def _verdict(pair: Pair, forced: bool) -> dict[str, Any] | None:
+    if pair.verdict is None:
+        return None
+    return {
+        "name": pair.verdict.name,
+        "reasons": list(pair.verdict.reasons),
+        "rivals": [asdict(rival) for rival in pair.verdict.rivals],
+        "forced": forced,
+    }
 
 
 def _is_rigid(T: Floats) -> bool:

@@ -10,7 +10,7 @@ what chance and self-similarity score on this pair.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from mtpcr_geo.match.judge import CLEAR_MARGIN, Judge
 from mtpcr_geo.match.pose import Pose, centre_of
 from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.pyramid import Level, Pyramid, search_factors
+from mtpcr_geo.match.reasons import nothing_to_compare
 from mtpcr_geo.match.search import GlobalSearch, Layer, distinct
 from mtpcr_geo.match.terrain import FEWEST_CELLS as FEWEST_GROUND_CELLS
 from mtpcr_geo.match.terrain import Terrain, TerrainSearch, place_on
@@ -121,10 +122,7 @@ def match(
                 break
     pool = search.pool
     if not pool.candidates:
-        raise RegistrationError(
-            "no pose brings the two rasters to overlap enough to compare; the clouds may be too small or too "
-            f"sparse for cells of {source.grid.cell:g} m: give a finer --cell, or larger clouds"
-        )
+        raise RegistrationError(nothing_to_compare(source, target, search.fewest(1), prior is not None))
     null_ratio = None
     if twin is not None:
         twin.catch_up(search)
@@ -158,7 +156,10 @@ def match(
         source_px=patches.source_px,
         target_px=patches.target_px,
         score=np.clip(patches.score, 0.0, 1.0),
-        hypotheses=tuple(c.pose.hypothesis(pivot) for c in pool.candidates),
+        hypotheses=tuple(
+            replace(c.pose.hypothesis(pivot), strength=strength)
+            for c, strength in zip(pool.candidates, pool.strengths, strict=True)
+        ),
         search_radius_m=radius,
         margin=pool.margin,
         support=best.support,
@@ -299,14 +300,18 @@ class _Search:
         step = np.degrees(1.5 / max(rim, 1.0))
         return float(np.radians(np.clip(step, FINEST_YAW_STEP_DEG, COARSEST_YAW_STEP_DEG)))
 
+    def fewest(self, factor: int) -> float:
+        """Return how many cells of a level both rasters must fill at a pose for it to be considered."""
+        layers = self.pyramid.at(factor)
+        smaller = min(float(layer.channels.mask.sum()) for layer in layers)
+        share = self.settings.min_overlap_share * smaller
+        return max(self._least_m2 / layers[0].grid.cell ** 2, share, FEWEST_OVERLAP_CELLS)
+
     def _propose(self, factor: int) -> list[Pose]:
         """Propose the poses under which both channels agree best at a level."""
         source, target = self.pyramid.at(factor)
         cell, prior = source.grid.cell, self.prior
-        smaller = min(float(layer.channels.mask.sum()) for layer in (source, target))
-        fewest = max(
-            self._least_m2 / cell**2, self.settings.min_overlap_share * smaller, FEWEST_OVERLAP_CELLS
-        )
+        fewest = self.fewest(factor)
         step = self._yaw_step(source)
         count = round(2 * np.pi / step)
         yaws = np.arange(count) * (2 * np.pi / count)

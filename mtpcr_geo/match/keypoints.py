@@ -120,7 +120,9 @@ class KeypointMatcher:
             seen = max(len(o.found.source_keypoints) for o in tried), len(best.found.target_keypoints)
             raise RegistrationError(
                 f"{self.name} finds no match between the images ({seen[0]} keypoints in the source's, "
-                f"{seen[1]} in the target's); they may be blank, too small, or of different places"
+                f"{seen[1]} in the target's, of {source.image.size:,} and {target.image.size:,} pixels); "
+                "they may be blank, too small, or of different places: try another cell (option cell), or "
+                "the matcher correlation"
             )
         hypotheses = _hypotheses(tried)
         # two matches agree on any pose, so that one more counts as the least of a next pose
@@ -259,5 +261,5 @@ def _hypotheses(tried: list[Orientation]) -> tuple[Hypothesis, ...]:
             for other in kept
         )
         if count and not alike:
-            kept.append(Hypothesis(yaw, shift, float(count)))
+            kept.append(Hypothesis(yaw, shift, float(count), strength=float(count)))
     return tuple(kept)

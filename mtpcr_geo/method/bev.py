@@ -54,8 +54,9 @@ def grid_around(minimum: Floats, maximum: Floats, cell: float) -> Grid:
     width, height = int(east - west), int(north - south)
     if width * height > MAX_CELLS:
         raise RegistrationError(
-            f"a raster of {width} x {height} cells of {cell:g} m is too large; "
-            "give a coarser --cell, or crop the cloud to the place it shares with the other one"
+            f"a raster of {width} x {height} cells of {cell:g} m is too large: {MAX_CELLS:,} cells are the "
+            "most; give a coarser cell (option cell), crop the cloud to the place it shares with the other "
+            "one, or remove points far from the rest"
         )
     return Grid(float(west * cell), float(north * cell), cell, width, height)
 

@@ -13,6 +13,7 @@ from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import IcpMethod, IcpRound
+from mtpcr_geo.core.wording import only
 from mtpcr_geo.method.downsample import near, thinned
 from mtpcr_geo.method.neighbourhoods import local_shapes
 from mtpcr_geo.method.overlap import overlap_of
@@ -102,9 +103,13 @@ class Surfaces:
             farthest = max_correspondence_distance_m
             of_source, of_target = of_source[near(s, t, farthest)], of_target[near(t, s, farthest)]
         if min(len(of_source), len(of_target)) < FEWEST_POINTS:
+            role = "source" if len(of_source) <= len(of_target) else "target"
             raise RegistrationError(
-                f"only {min(len(of_source), len(of_target))} points of one cloud lie in the overlap, "
-                "too few to refine"
+                f"{only(min(len(of_source), len(of_target)), 'point')} of the {role} lie in the "
+                f"overlap, within {max_correspondence_distance_m:g} m of the other cloud, and "
+                f"{FEWEST_POINTS} are needed to refine the pose: it brings hardly any of the clouds "
+                "together, or they are too sparse; give denser clouds, or leave the refinement out (method "
+                "none of mtpcr.refine in a pipeline)"
             )
         self.T_start = T_start
         self.voxel_m = voxel_m

@@ -98,10 +98,21 @@ def filled_share(bev: Bev) -> float:
 
 def scales_of(source: Bev, target: Bev) -> Scales:
     """Derive the lengths of search and judgement from two rasters; see the table above."""
-    cell = max(source.grid.cell, target.grid.cell)
     areas = [occupied_area(bev) for bev in (source, target)]
-    extent = float(np.sqrt(max(min(areas), cell**2)))
     fill = filled_share(source) * filled_share(target)
+    return scales_for(max(source.grid.cell, target.grid.cell), min(areas), fill)
+
+
+def scales_for(cell: float, area_m2: float, fill: float = 1.0) -> Scales:
+    """Derive the same from numbers.
+
+    Args:
+        cell: of the rasters, metres.
+        area_m2: occupied area of the smaller cloud, square metres.
+        fill: share of the cells that are filled in both rasters where both have points.
+
+    """
+    extent = float(np.sqrt(max(area_m2, cell**2)))
     fewest = MIN_PATCH_CELLS * cell
     filled = min(float(np.sqrt(FEWEST_FILLED_IN_PATCH / max(fill, 0.01))) * cell, extent / 2.0)
     patch = max(min(extent / 4.0, MAX_PATCH_M), fewest, filled)
@@ -110,7 +121,7 @@ def scales_of(source: Bev, target: Bev) -> Scales:
         extent_m=extent,
         patch_m=patch,
         search_radius_m=max(min(patch / 4.0, MAX_SEARCH_RADIUS_M), MIN_SEARCH_RADIUS_CELLS * cell),
-        least_overlap_m2=min(LEAST_OVERLAP_SHARE * min(areas), MAX_LEAST_OVERLAP_M2),
+        least_overlap_m2=min(LEAST_OVERLAP_SHARE * area_m2, MAX_LEAST_OVERLAP_M2),
         terrain_cell_m=float(
             np.clip(max(extent / 8.0, 4.0 * cell), MIN_TERRAIN_CELL_M, max(MAX_TERRAIN_CELL_M, 4.0 * cell))
         ),

@@ -16,6 +16,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.types import Solution, SolveSettings, TiePoints
+from mtpcr_geo.core.wording import only
 
 DEFAULTS = SolveSettings()
 
@@ -202,9 +203,12 @@ def solve_tie_points(
     used = np.flatnonzero(~(tie_points.held_out if held_out is None else held_out))
     least = 3
     if len(used) < least:
+        held = len(source) - len(used)
+        kept = f", {held} of them held out to judge by," if held else ""
         raise RegistrationError(
-            f"only {len(used)} tie points to solve a transform from, at least {least} are needed; "
-            "the clouds share too little, or another --cell or matcher may find more"
+            f"{only(len(source), 'tie point')} found{kept} and at least {least} are needed to solve "
+            "a transform from: too few places look alike in both rasters; give denser clouds or larger parts "
+            "of them, or another cell or matcher (options cell, matcher)"
         )
     s, t = source[used], target[used]
     start = None
@@ -212,7 +216,9 @@ def solve_tie_points(
         _, start = ransac_upright(s, t, tolerance, settings.seed, settings.tries)
         if start.sum() < least:
             raise RegistrationError(
-                f"of {len(used)} tie points no {least} agree on one yaw and shift; the clouds may not overlap"
+                f"of {len(used)} tie points no {least} agree on one yaw and shift within {tolerance:g} m: "
+                "what looks alike in both rasters is not the same place; see that the clouds overlap, or try "
+                "another cell or matcher (options cell, matcher)"
             )
     # a robust start bounds how far agreeing tie points may lie apart; the paper has no such bound
     ceiling = 2.0 * tolerance if settings.robust_start else np.inf

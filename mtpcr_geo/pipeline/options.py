@@ -308,7 +308,7 @@ Motion = Annotated[
 ]
 Force = Annotated[
     bool,
-    Field(description="write the registered cloud and its transform though the verdict refuses them"),
+    Field(description="write the registered cloud and its transform though the verdict withholds them"),
     Shown(RESULT),
 ]
 Overwrite = Annotated[bool, Field(description="replace files that are there already"), Shown(OUTPUT)]

@@ -20,8 +20,10 @@ class StageRecord:
         options: all its options, for the audit.
         seconds: wall time.
         metadata: what it reported, for the audit.
-        skipped: why it did not run, or None.
+        skipped: why it did not run, or made nothing, or None.
         failed: why it could not go on, or None.
+        not_written: files that it would have written, and why it did not.
+        forced: whether it wrote, or let through, what the verdict withholds.
 
     """
 
@@ -32,6 +34,8 @@ class StageRecord:
     metadata: Mapping[str, Any]
     skipped: str | None = None
     failed: str | None = None
+    not_written: Mapping[Path, str] = field(default_factory=dict)
+    forced: bool = False
 
     def audit(self) -> dict[str, Any]:
         """Return the record as a dict, for JSON and reports."""
@@ -108,6 +112,41 @@ class RunFacts:
             "inputs": [
                 {"path": str(file.path), "bytes": file.size, "sha256": file.sha256} for file in self.inputs
             ],
+        }
+
+
+@dataclass(frozen=True)
+class Written:
+    """What a run left, and what it did not: the same for terminal, report and run.json.
+
+    Attributes:
+        files: in place, or about to be.
+        withheld: files that are not written, and why not.
+        forced: whether files were written that the verdict withholds.
+
+    """
+
+    files: tuple[Path, ...]
+    withheld: Mapping[Path, str]
+    forced: bool
+
+    @classmethod
+    def of(cls, done: Iterable[StageRecord], files: Iterable[Path]) -> Written:
+        """Gather it from the finished stages and the files written."""
+        done, files = list(done), tuple(files)
+        withheld = {path: why for record in done for path, why in record.not_written.items()}
+        return cls(
+            files,
+            {path: why for path, why in withheld.items() if path not in files},
+            any(record.forced for record in done),
+        )
+
+    def audit(self) -> dict[str, Any]:
+        """Return it as a dict, for JSON and reports; withheld files as a list with their reasons."""
+        return {
+            "files": [str(path) for path in self.files],
+            "withheld": [{"path": str(path), "why": why} for path, why in self.withheld.items()],
+            "forced": self.forced,
         }
 
 

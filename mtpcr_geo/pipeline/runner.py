@@ -16,7 +16,7 @@ from mtpcr_geo.core.types import Pair, Verdict
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.pipeline.grammar import StageSpec
 from mtpcr_geo.pipeline.plan import plan
-from mtpcr_geo.pipeline.records import RunFacts, StageRecord, input_files
+from mtpcr_geo.pipeline.records import RunFacts, StageRecord, Written, input_files
 from mtpcr_geo.pipeline.stage import Node, RunContext, Stage, Value
 
 
@@ -62,6 +62,11 @@ class RunResult:
         pairs = [value for value in self.values.values() if isinstance(value, Pair)]
         judged = [pair for pair in pairs if pair.verdict is not None]
         return (judged or pairs)[-1] if pairs else None
+
+    @property
+    def written(self) -> Written:
+        """What the run left, what it withheld and why."""
+        return Written.of(self.done, self.outputs)
 
     @property
     def verdict(self) -> Verdict | None:
@@ -152,7 +157,9 @@ def run(
         context = RunContext(outputs, progress or NoProgress())
         context.facts = _facts(nodes, before)
         if before is not None:
-            context.done, context.failure = list(before.done), before.failure
+            # what that run wrote or withheld is on record there
+            context.done = [replace(record, not_written={}, forced=False) for record in before.done]
+            context.failure = before.failure
         with closing(context):
             _check(nodes, context)
             if any(stage.evidence for stage in stages):
@@ -251,10 +258,11 @@ def _preview(nodes: Sequence[Node], context: RunContext) -> None:
 def _turn(stage: Stage, inputs: Sequence[Value | None], context: RunContext) -> Value | None:
     """Run one stage, or skip it, and put it on record."""
     start = time.perf_counter()
-    skipped = failed = None
+    failed = None
     value: Value | None = None
     if not stage.evidence and (context.failure is not None or None in inputs):
-        skipped = "the registration was refused before"
+        stage.skipped = _why_skipped(context)
+        stage.not_written |= dict.fromkeys(stage.writes(), stage.skipped)
         value = next((given for given in inputs if isinstance(given, Pair)), None)
     else:
         try:
@@ -266,10 +274,28 @@ def _turn(stage: Stage, inputs: Sequence[Value | None], context: RunContext) -> 
             value = pair and pair.with_(verdict=Verdict("refused", (failed,), {}))
     options = stage.options.model_dump(mode="json")
     seconds = time.perf_counter() - start
-    record = StageRecord(stage.type, stage.tag, options, seconds, stage.metadata, skipped, failed)
+    record = StageRecord(
+        stage.type,
+        stage.tag,
+        options,
+        seconds,
+        stage.metadata,
+        stage.skipped,
+        failed,
+        dict(stage.not_written),
+        stage.forced,
+    )
     context.done.append(record)
     context.recorder.after(stage.type, stage.tag, options, value, seconds)
     return value
+
+
+def _why_skipped(context: RunContext) -> str:
+    """Say why a stage has nothing to go on with: no transform was found, or one before made nothing."""
+    if context.failure is not None:
+        return "no transform was found"
+    reasons = [record.skipped for record in context.done if record.skipped is not None]
+    return reasons[-1] if reasons else "the stage before made nothing"
 
 
 @contextmanager

@@ -116,6 +116,9 @@ class Stage(ABC):
         self.options = options
         self.tag = tag
         self.metadata: dict[str, Any] = {}
+        self.skipped: str | None = None
+        self.not_written: dict[Path, str] = {}
+        self.forced = False
 
     def check(self, context: RunContext) -> None:  # noqa: B027 - most stages have nothing to check
         """Find out before the run what would stop this stage: files, folders, optional parts.

@@ -2,24 +2,28 @@
 
 The verdict never rests on the fit's own residual. It rests on what the fit did not see or could not have
 arranged: tie points held out from the solve, how far the best hypothesis stands above the next distinct
-one, and
-how much ground both clouds share.
+one, and how much ground both clouds share. Each check that is not met says what was found, what was wanted,
+and what to do.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core.statistics import neg_log10_p
-from mtpcr_geo.core.types import Verdict, VerdictName
+from mtpcr_geo.core.types import Rival, Verdict, VerdictName
+from mtpcr_geo.core.wording import beside, only, percent
 
 Floats = NDArray[np.float64]
 
 FEWEST_GROUND_CELLS = 30
+FEWEST_HELD_OUT = 4
+LITTLE_SHARED = 0.2
+MOST_NAMED = 3
 KEPT_SHARE = 0.5
 """Share of the agreeing tie points that refinement must not lose."""
 
@@ -44,6 +48,10 @@ class Evidence:
             there is no right pose; None where it was not searched.
         overlap_m2: area both clouds cover under the result, square metres.
         least_overlap_m2: the least overlap worth accepting, from both clouds' areas, square metres.
+        missing: what keeps the rasters from giving many matches and what to do, where that is seen.
+        rivals: the other hypotheses, strongest first.
+        mapped: whether the target's frame has east and north.
+        not_levelled: for each cloud whose vertical is not known and was not found, a sentence that says so.
         overlap_source, overlap_target: shares of each cloud's area that lie in the overlap.
         ground_cells: cells where both see the ground.
         ground_agreeing: of these, cells whose heights agree.
@@ -73,6 +81,10 @@ class Evidence:
     null_ratio: float | None = None
     least_overlap_m2: float = 400.0
     contradictions: tuple[str, ...] = ()
+    missing: str | None = None
+    rivals: tuple[Rival, ...] = ()
+    mapped: bool = True
+    not_levelled: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -114,72 +126,26 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
     """
     digits = neg_log10_p_of(evidence)
     share = evidence.held_out_agreeing / max(evidence.held_out, 1)
-    refusals, doubts = [], []
-    reported = (
-        f"{evidence.held_out_agreeing} of {evidence.held_out} held-out tie points agree "
-        f"within {evidence.tolerance_m:g} m"
-    )
-    if evidence.held_out < 4:
-        doubts.append(
-            f"only {evidence.held_out} tie points could be held out, too few to check the result by"
-        )
-    elif digits < limits.doubtful_neg_log10_p:
-        refusals.append(f"{reported}, no more than chance would give")
-    elif digits < limits.neg_log10_p or share < limits.agreeing:
-        doubts.append(f"{reported}, hardly more than chance would give")
-    if evidence.margin is not None:
-        if evidence.margin < 1.0:
-            refusals.append(f"another pose fits better (margin {evidence.margin:.2f})")
-        elif evidence.margin < limits.margin:
-            doubts.append(
-                f"another pose fits nearly as well (margin {evidence.margin:.2f}, wanted {limits.margin:g})"
-            )
-    if evidence.refined_away_m > limits.refined_away * evidence.tolerance_m:
-        doubts.append(
-            f"the refinement went {evidence.refined_away_m:.1f} m away from where the tie points had led"
-        )
-    if evidence.refinement_lost:
-        doubts.append(
-            "the refinement lost the tie points and was not followed; the result is as exact as they are"
-        )
-    final = evidence.final_agreeing
-    if final is not None and final < KEPT_SHARE * evidence.held_out_agreeing:
-        refusals.append(
-            f"the final transform agrees with {final} tie points only, {evidence.held_out_agreeing} agreed "
-            f"before"
-        )
-    ground = evidence.ground_agreeing / max(evidence.ground_cells, 1)
-    if evidence.ground_cells >= FEWEST_GROUND_CELLS and ground < limits.ground_agreeing:
-        doubts.append(f"only {ground:.0%} of the ground that both clouds see agrees in height")
-    if evidence.null_ratio is not None and evidence.null_ratio < limits.null_ratio:
-        doubts.append(
-            f"it fits only {evidence.null_ratio:.2f} times as well as the mirrored source, which has no "
-            f"right pose (wanted {limits.null_ratio:g})"
-        )
-    least = evidence.least_overlap_m2 if limits.overlap_m2 is None else limits.overlap_m2
-    shared = f"the clouds share only {evidence.overlap_m2:.0f} m2 under this result, wanted {least:.0f}"
-    if evidence.overlap_m2 < least / 4:
-        refusals.append(shared)
-    elif evidence.overlap_m2 < least:
-        doubts.append(shared)
+    findings = [
+        held_out_finding(evidence, limits),
+        margin_finding(evidence, limits),
+        *refinement_findings(evidence, limits),
+        ground_finding(evidence, limits),
+        null_finding(evidence, limits),
+        overlap_finding(evidence, limits),
+    ]
+    refusals = [found.text for found in findings if found is not None and found.refuses]
+    doubts = [found.text for found in findings if found is not None and not found.refuses]
     doubts += evidence.contradictions
-    if len(doubts) >= 2 and digits < limits.neg_log10_p:
-        refusals.append("several checks fail at once: " + "; ".join(doubts))
-        doubts = []
+    if len(doubts) >= 2 and digits < limits.neg_log10_p and not refusals:
+        value, wanted = beside(digits, limits.neg_log10_p, 1)
+        refusals = [
+            f"{len(doubts)} checks are not met, and the held-out tie points do not make up for it "
+            f"(significance {value}, wanted {wanted})"
+        ]
     name: VerdictName = "refused" if refusals else "doubtful" if doubts else "accepted"
-    reasons = [*refusals, *doubts]
-    if name == "accepted":
-        reasons = [reported]
-        if evidence.margin is not None:
-            reasons.append(f"the next distinct pose is {evidence.margin:.1f} times weaker")
-        if evidence.null_ratio is not None:
-            reasons.append(
-                f"the mirrored source, which has no right pose, fits {evidence.null_ratio:.1f} times worse"
-            )
-        reasons.append(
-            f"the clouds share {evidence.overlap_m2:.0f} m2: {evidence.overlap_source:.0%} of the source, "
-            f"{evidence.overlap_target:.0%} of the target"
-        )
+    reasons = [*refusals, *doubts] if name != "accepted" else _grounds(evidence)
+    rivals = tuple(rival for rival in evidence.rivals if rival.margin < limits.margin)
     metrics: dict[str, Any] = {
         "held_out_tie_points": evidence.held_out,
         "held_out_agreeing": evidence.held_out_agreeing,
@@ -195,9 +161,236 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
         "overlap_target": evidence.overlap_target,
         "ground_cells": evidence.ground_cells,
         "ground_agreeing": evidence.ground_agreeing,
+        "ground_checked": ground_checked(evidence),
         "refined_away_m": evidence.refined_away_m,
     }
-    return Verdict(name, tuple(reasons), metrics | (more or {}))
+    notes = not_checked(evidence, name)
+    return Verdict(name, (*reasons, *notes), metrics | (more or {}), () if name == "accepted" else rivals)
+
+
+def _grounds(evidence: Evidence) -> list[str]:
+    """Return what an acceptance rests on."""
+    grounds = [_agreement(evidence)]
+    if evidence.margin is not None:
+        grounds.append(f"the next distinct pose is {evidence.margin:.1f} times weaker")
+    if evidence.null_ratio is not None:
+        grounds.append(
+            f"the mirrored source, which has no right pose, fits {evidence.null_ratio:.1f} times worse"
+        )
+    return [
+        *grounds,
+        f"the clouds share {evidence.overlap_m2:.0f} m2: {evidence.overlap_source:.0%} of the source, "
+        f"{evidence.overlap_target:.0%} of the target",
+    ]
+
+
+def _agreement(evidence: Evidence) -> str:
+    return (
+        f"{evidence.held_out_agreeing} of {evidence.held_out} held-out tie points agree "
+        f"within {evidence.tolerance_m:g} m"
+    )
+
+
+def ground_checked(evidence: Evidence) -> bool:
+    """Return whether both clouds see enough ground in common to compare its heights."""
+    return evidence.ground_cells >= FEWEST_GROUND_CELLS
+
+
+def not_checked(evidence: Evidence, name: VerdictName) -> list[str]:
+    """Return what could not be checked, or was not known, whatever the verdict."""
+    notes = []
+    if not ground_checked(evidence):
+        notes.append(
+            f"not checked: the heights of the ground, which both clouds see in "
+            f"{only(evidence.ground_cells, 'cell')} (wanted {FEWEST_GROUND_CELLS})"
+        )
+    if name != "accepted":
+        notes += [
+            f"{text}; if it leans, that spoils the match: name its CRS, or level it beforehand"
+            for text in evidence.not_levelled
+        ]
+    return notes
+
+
+@dataclass(frozen=True)
+class CheckFinding:
+    """A check that is not met.
+
+    Attributes:
+        text: what was found, what was wanted, what to do.
+        refuses: whether it refuses the result; else it makes it doubtful.
+
+    """
+
+    text: str
+    refuses: bool = False
+
+
+def held_out_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
+    """Judge how many held-out tie points agree, and whether they are enough to tell."""
+    digits = neg_log10_p_of(evidence)
+    share = evidence.held_out_agreeing / max(evidence.held_out, 1)
+    if evidence.held_out < FEWEST_HELD_OUT:
+        return CheckFinding(
+            f"{only(evidence.held_out, 'tie point')} found, too few to check the result by (wanted "
+            f"{FEWEST_HELD_OUT}); {_for_more_tie_points(evidence)}"
+        )
+    reached, wanted = beside(digits, limits.neg_log10_p, 1)
+    if digits < limits.neg_log10_p and best_neg_log10_p(evidence) < limits.neg_log10_p:
+        return CheckFinding(
+            f"{_agreement(evidence)}: so few tie points cannot rule out chance, even if all agree "
+            f"(significance {reached}, wanted {wanted}); {_for_more_tie_points(evidence)}",
+            refuses=digits < limits.doubtful_neg_log10_p,
+        )
+    if digits < limits.doubtful_neg_log10_p:
+        reached, wanted = beside(digits, limits.doubtful_neg_log10_p, 1)
+        return CheckFinding(
+            f"{_agreement(evidence)}, no more than chance would give (significance {reached}, refused below "
+            f"{wanted}); {evidence.missing or _OTHER_PLACES}",
+            refuses=True,
+        )
+    if digits < limits.neg_log10_p:
+        return CheckFinding(
+            f"{_agreement(evidence)}, hardly more than chance would give (significance {reached}, wanted "
+            f"{wanted}); look at the result before use"
+        )
+    if share < limits.agreeing:
+        found, least = percent(share, limits.agreeing)
+        return CheckFinding(
+            f"{_agreement(evidence)}: {found}, wanted {least}; most places that look alike lie elsewhere "
+            "under this result, look at it before use"
+        )
+    return None
+
+
+_OTHER_PLACES = "the clouds may show different places, or too little of the same"
+
+
+def best_neg_log10_p(evidence: Evidence) -> float:
+    """Return the significance that the held-out tie points would reach if all of them agreed."""
+    return neg_log10_p_of(replace(evidence, held_out_agreeing=evidence.held_out))
+
+
+def _for_more_tie_points(evidence: Evidence) -> str:
+    """Say what would give more tie points."""
+    if evidence.missing is not None:
+        return evidence.missing
+    if max(evidence.overlap_source, evidence.overlap_target) < LITTLE_SHARED:
+        return (
+            f"the clouds share {evidence.overlap_m2:.0f} m2 under this result: give parts of them that share "
+            "more"
+        )
+    return "little in them stands out alike: give larger or denser clouds, or try another cell (option cell)"
+
+
+def margin_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
+    """Judge the strength of the pose against that of the next distinct one, and name the rivals."""
+    margin = evidence.margin
+    if margin is None or margin >= limits.margin:
+        return None
+    near = [rival for rival in evidence.rivals if rival.margin < limits.margin]
+    others = "; ".join(_rival_text(rival, evidence.mapped) for rival in near[:MOST_NAMED])
+    others += "; ..." if len(near) > MOST_NAMED else ""
+    what = f"another pose, {others}," if len(near) == 1 else "another pose"
+    value, wanted = beside(margin, limits.margin, 2)
+    if margin < 1.0:
+        text = f"{what} fits better (margin {beside(margin, 1.0, 2)[0]}, wanted {wanted})"
+    elif len(near) > 1:
+        text = f"{len(near)} other poses fit nearly as well (margin {value}, wanted {wanted}): {others}"
+    else:
+        text = f"{what} fits nearly as well (margin {value}, wanted {wanted})"
+    return CheckFinding(f"{text}; {_AGAINST_RIVALS}", refuses=margin < 1.0)
+
+
+_AGAINST_RIVALS = (
+    "the site repeats itself, or too little of it is shared: give larger parts of the clouds, or a prior if "
+    "the place is known (option prior)"
+)
+
+
+def _rival_text(rival: Rival, mapped: bool) -> str:
+    """Say where a rival lies from the pose found."""
+    ways = (
+        (("east", "west"), ("north", "south"))
+        if mapped
+        else (("along +x", "along -x"), ("along +y", "along -y"))
+    )
+    parts = [
+        f"{abs(value):.{0 if abs(value) >= 10 else 1}f} m {way[0] if value > 0 else way[1]}"
+        for value, way in zip((rival.east_m, rival.north_m), ways, strict=True)
+        if abs(value) >= max(0.05, 0.1 * rival.apart_m)
+    ]
+    where = ", ".join(parts) or "at the same place"
+    return f"{where}, {abs(rival.turn_deg):.0f} deg turned"
+
+
+def refinement_findings(evidence: Evidence, limits: Limits) -> list[CheckFinding]:
+    """Judge whether the refinement stayed with the tie points."""
+    found = []
+    most = limits.refined_away * evidence.tolerance_m
+    if evidence.refined_away_m > most:
+        value, limit = beside(evidence.refined_away_m, most, 1)
+        found.append(
+            CheckFinding(
+                f"the refinement went {value} m away from where the tie points had led (at most {limit} m is "
+                "expected); look whether surfaces meet in the report"
+            )
+        )
+    if evidence.refinement_lost:
+        found.append(
+            CheckFinding(
+                "the refinement lost the tie points and was not followed; the result is as exact as they "
+                f"are, about {evidence.tolerance_m:g} m"
+            )
+        )
+    final, agreed = evidence.final_agreeing, evidence.held_out_agreeing
+    if final is not None and final < KEPT_SHARE * agreed:
+        found.append(
+            CheckFinding(
+                f"the final transform agrees with {only(final, 'tie point')}, {agreed} agreed before "
+                f"(at least {KEPT_SHARE:.0%} of them are wanted): the refinement left them",
+                refuses=True,
+            )
+        )
+    return found
+
+
+def ground_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
+    """Judge whether the ground that both see agrees in height, where enough of it is seen."""
+    share = evidence.ground_agreeing / max(evidence.ground_cells, 1)
+    if not ground_checked(evidence) or share >= limits.ground_agreeing:
+        return None
+    value, wanted = percent(share, limits.ground_agreeing)
+    return CheckFinding(
+        f"only {value} of the ground that both clouds see agrees in height (wanted {wanted}, "
+        f"{evidence.ground_cells} cells compared): the place is wrong, one cloud leans, or the ground has "
+        "changed"
+    )
+
+
+def null_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
+    """Judge the strength of the pose against what a mirrored source reaches."""
+    if evidence.null_ratio is None or evidence.null_ratio >= limits.null_ratio:
+        return None
+    value, wanted = beside(evidence.null_ratio, limits.null_ratio, 2)
+    mirrored = "the mirrored source, which has no right pose"
+    text = f"it fits only {value} times as well as {mirrored} (wanted {wanted})"
+    if evidence.null_ratio < 1.0:
+        text = f"it fits less well than {mirrored} ({value} times, wanted {wanted})"
+    return CheckFinding(f"{text}; the pose is no surer than chance makes one: look at it before use")
+
+
+def overlap_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
+    """Judge how much ground the clouds share under the result."""
+    least = evidence.least_overlap_m2 if limits.overlap_m2 is None else limits.overlap_m2
+    if evidence.overlap_m2 >= least:
+        return None
+    value, wanted = beside(evidence.overlap_m2, least)
+    return CheckFinding(
+        f"the clouds share only {value} m2 under this result, wanted {wanted}: {evidence.overlap_source:.0%} "
+        f"of the source, {evidence.overlap_target:.0%} of the target; give parts of them that share more",
+        refuses=evidence.overlap_m2 < least / 4,
+    )
 
 
 def neg_log10_p_of(evidence: Evidence) -> float:

@@ -10,15 +10,19 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.statistics import chance_within
-from mtpcr_geo.core.types import Pair, SolveSettings, TiePoints
+from mtpcr_geo.core.types import Hypothesis, Pair, Rival, SolveSettings, TiePoints
 from mtpcr_geo.crs.chain import TransformChain
+from mtpcr_geo.match.base import margin_of
 from mtpcr_geo.method.overlap import overlap_of
 from mtpcr_geo.method.scales import MAX_LEAST_OVERLAP_M2, ground_cell_for, scales_of, tolerance_for
+from mtpcr_geo.method.shortcomings import what_is_missing
 from mtpcr_geo.method.solve import solve_tie_points
 from mtpcr_geo.verdict.decision import Evidence
 
 GROUND_AGREES_M = 0.5
 UNBOUNDED_CELLS = 2.0
+FAR_TOLERANCES, FAR_TURN_DEG = 5.0, 5.0
+"""Tolerances in plan, or turn, from which on another pose is another place and not the same a little off."""
 TIE_POINTS_PER_PATCH = 4
 """Patches overlap by half, so about four tie points tell what one independent tie would."""
 
@@ -72,6 +76,14 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         null_ratio=matches.null_ratio if matches is not None else None,
         least_overlap_m2=_least_overlap_m2(pair),
         final_agreeing=int((residual < tolerance).sum()),
+        missing=_missing(pair),
+        rivals=rivals_of(pair, tolerance),
+        mapped=pair.frame.crs is not None,
+        not_levelled=tuple(
+            f"the {side.role} was not levelled: {side.levelling.why or 'nothing tells its vertical'}"
+            for side in (pair.source, pair.target)
+            if side.levelling.method == "none" and not side.levelling.trusted
+        ),
     )
     shift = T[:3, 3]
     offset = TransformChain.of(pair).vertical_offset_m
@@ -90,6 +102,43 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         ),
     }
     return evidence, more
+
+
+def rivals_of(pair: Pair, tolerance: float) -> tuple[Rival, ...]:
+    """Return the matcher's other hypotheses, strongest first, by where they put the middle of the tie points.
+
+    Args:
+        pair: with matches and tie points.
+        tolerance: plan distance within which a tie point agrees, metres.
+
+    """
+    hypotheses = pair.matches.hypotheses if pair.matches is not None else ()
+    ranked = [one for one in hypotheses if one.strength is not None]
+    if len(ranked) < 2 or pair.tie_points is None or not len(pair.tie_points):
+        return ()
+    middle = pair.tie_points.source[:, :2].mean(axis=0)
+    best = ranked[0]
+    found = []
+    for other in sorted(ranked[1:], key=lambda one: -(one.strength or 0.0)):
+        east, north = _placed(other, middle) - _placed(best, middle)
+        turn = float((np.degrees(other.yaw - best.yaw) + 180.0) % 360.0 - 180.0)
+        far = bool(np.hypot(east, north) > FAR_TOLERANCES * tolerance or abs(turn) > FAR_TURN_DEG)
+        margin = margin_of([best.strength or 0.0, other.strength or 0.0])
+        found.append(Rival(float(east), float(north), turn, margin, far))
+    return tuple(found)
+
+
+def _placed(hypothesis: Hypothesis, xy: Floats) -> Floats:
+    """Return where a hypothesis puts a (2,) point of the levelled source, (2,) metres."""
+    c, s = np.cos(hypothesis.yaw), np.sin(hypothesis.yaw)
+    return np.asarray(np.array([[c, -s], [s, c]]) @ xy + hypothesis.shift)
+
+
+def _missing(pair: Pair) -> str | None:
+    """Say what keeps the rasters from giving many matches; None where nothing is seen to."""
+    if pair.source.bev is None or pair.target.bev is None:
+        return None
+    return what_is_missing(pair.source.bev, pair.target.bev)
 
 
 def _least_overlap_m2(pair: Pair) -> float:

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from mtpcr_geo.check import check_clouds
 from mtpcr_geo.check.pair import in_feet, relate
 from mtpcr_geo.check.place import code_of, within_area
-from mtpcr_geo.check.points import Measured, density_findings, height_findings, plan_findings
+from mtpcr_geo.check.points import Measured, height_findings, plan_findings
 from mtpcr_geo.check.show import json_of, print_report
 from mtpcr_geo.cli.app import app
 from mtpcr_geo.core.errors import OptionError
@@ -188,7 +188,7 @@ FILES = {
         "scale-overflow",
         "warning",
     ),
-    "far offset": (lambda p: write(p, hills(1), scale=0.01, offset=[0.0] * 3), "offset-far", "note"),
+    "far offset": (lambda p: write(p, hills(1), scale=0.006, offset=[0.0] * 3), "offset-far", "note"),
     "times of a week": (
         lambda p: patched(write(p, hills(1), gps_time=np.arange(20_000) + 1000.0), 6, "<H", 16),
         "gps-time",
@@ -223,8 +223,14 @@ FILES = {
     "tall": (lambda p: write(p, hills(1) * [1, 1, 60.0] - [0, 0, 6500.0]), "z-range", "warning"),
     "off the earth": (lambda p: write(p, hills(1) + [0, 0, 30_000.0]), "z-level", "warning"),
     "level as a table": (lambda p: write(p, hills(1) * [1, 1, 0]), "z-constant", "warning"),
-    "sparse": (lambda p: write(p, hills(1, 2000, size=(700.0, 700.0))), "sparse", "note"),
-    "few points": (lambda p: write(p, hills(1, 5000)), "few-points", "note"),
+    "sparse": (lambda p: write(p, hills(1, 2000, size=(700.0, 700.0))), "sparse", "warning"),
+    "small": (lambda p: write(p, hills(1, 5000, size=(6.0, 5.0))), "cells-few", "warning"),
+    "rather small": (lambda p: write(p, hills(1, 5000, size=(11.0, 9.0))), "cells-few", "note"),
+    "thin on a small place": (lambda p: write(p, hills(1, 500, size=(28.0, 26.0))), "cells-few", "warning"),
+    "flat as a field": (lambda p: write(p, hills(1) * [1, 1, 1e-3] + [0, 0, 120.0]), "flat", "warning"),
+    "no returns": (
+        lambda p: write(p, np.vstack([hills(1), np.tile(hills(1)[:1], (1000, 1))])), "piled", "warning",
+    ),
     "feet": (
         lambda p: write(p, hills(1, place=(4.2e6, 1.3e6, 400.0)), CRS.from_epsg(2994)),
         "z-unit-unsaid",
@@ -287,7 +293,7 @@ def test_what_the_user_says_stands_over_the_file(good, tmp_path):
     assert "ETRS89 / UTM zone 32N" in only(report, "crs-overridden").what
     assert report.clouds["source"].crs_by == "option"
     assert codes(check_clouds(good[0], source_crs="EPSG:25832")) == []
-    assert codes(check_clouds(good[0], local=True)) == ["crs-overridden"]
+    assert codes(check_clouds(good[0], local=True), "warning") == []
     odd = write(tmp_path / "odd.las", hills(1), "PROJCS[oops")
     assert "cannot be understood" in only(check_clouds(odd), "crs-missing").what
     assert only(check_clouds(odd, source_crs="EPSG:25832"), "crs-unreadable").severity == "note"
@@ -336,7 +342,7 @@ PAIRS = {
     "target": ("same-cloud", "error", 5),
     "bare": ("crs-missing", "error", 6),
     "swapped": ("axes-swapped", "warning", 6),
-    "sliver": ("little-overlap", "note", 0),
+    "sliver": ("little-overlap", "warning", 0),
     "huge": ("plan-stray", "warning", 0),
 }
 
@@ -515,8 +521,6 @@ def test_pure_findings_of_points():
     missed = Measured(xyz, low, high + [4000.0, 0.0, 900.0], 120.0, 5.0, 1000.0)  # not in the sample
     assert [found.code for found in height_findings(missed, "metre", True, "source")] == ["z-stray"]
     assert [found.code for found in plan_findings(missed, "source")] == ["plan-stray"]
-    (very,) = density_findings(Measured(xyz, low, high, 0.0, 0.05, 1e5), 50_000, "target")
-    assert (very.severity, very.code, very.role) == ("warning", "sparse", "target")
 
 
 @pytest.mark.parametrize(
@@ -536,3 +540,102 @@ def test_real_pairs_are_sound(name, words, shared_data):
     assert codes(report, "error") == codes(report, "warning") == []
     assert report.relation is not None
     assert report.relation.name == "overlapping"
+
+
+def test_a_plot_may_be_narrower_than_its_trees_are_high():
+    rng = np.random.default_rng(3)
+    trees = rng.uniform([0.0, 0.0, 0.0], [25.0, 25.0, 40.0], (20_000, 3))
+    low, high = trees.min(axis=0), trees.max(axis=0)
+    assert (
+        list(height_findings(Measured(trees, low, high, 300.0, 30.0, 625.0), "metre", True, "source")) == []
+    )
+    tower = trees * [1, 1, 4.0]
+    low, high = tower.min(axis=0), tower.max(axis=0)
+    (found,) = height_findings(Measured(tower, low, high, 300.0, 30.0, 625.0), "metre", True, "source")
+    assert found.code == "z-range"
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ((-164.0, -60.0, 2.0), "look local"),
+        ((1000.0, 5000.0, 2.0), "look local"),
+        ((84_808.0, 447_412.0, 0.0), "look like a national grid or UTM"),
+        ((440_000.0, 5_400_000.0, 0.0), "look like a national grid or UTM"),
+        ((-73_000.0, 214_000.0, 0.0), "look like a national grid or UTM"),
+    ],
+)
+def test_what_coordinates_without_a_crs_look_like(place, words, tmp_path):
+    report = check_clouds(
+        write(tmp_path / "a.las", hills(1, place=np.array(place), size=(228.0, 120.0)), None)
+    )
+    (found,) = [found for found in report.findings if found.code == "crs-missing"]
+    assert words in found.what
+
+
+def leaning(xyz, degrees):
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    middle = xyz.mean(axis=0)
+    return (xyz - middle) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]).T + middle
+
+
+def test_the_vertical_of_a_local_cloud_is_looked_for(tmp_path):
+    flat = hills(1, 60_000, place=np.zeros(3)) * [1, 1, 0.05]
+    tilted, upright = (
+        write(tmp_path / "t.las", leaning(flat, 6.0), None),
+        write(tmp_path / "u.las", flat, None),
+    )
+    report = check_clouds(tilted, upright, local=True)
+    assert [found.role for found in report.findings if found.code == "leans"] == ["source"]
+    (found,) = [found for found in report.findings if found.code == "leans"]
+    assert "leans by 5.9 degrees" in found.what or "leans by 6.0 degrees" in found.what
+    lumps = np.random.default_rng(5).uniform([0, 0, 0], [60, 60, 40], (30_000, 3))
+    unknown = check_clouds(write(tmp_path / "l.las", lumps, None), source_crs="local")
+    assert "vertical-unknown" in codes(unknown, "note")
+    # a CRS tells the vertical
+    stated = check_clouds(write(tmp_path / "s.las", leaning(flat, 6.0) + PLACE))
+    assert not {"leans", "vertical-unknown"} & set(codes(stated, "note"))
+
+
+def test_ground_that_one_of_them_does_not_see_is_named(tmp_path):
+    rng = np.random.default_rng(9)
+    target = write(tmp_path / "t.las", hills(1, 60_000))
+    bits = hills(2, 60_000)
+    bits = bits[(np.mod(bits[:, 0], 50.0) < 4.0) & (np.mod(bits[:, 1], 40.0) < 4.0)]
+    sees_little = check_clouds(write(tmp_path / "s.las", bits[rng.permutation(len(bits))[:400]]), target)
+    assert "ground-unseen" in codes(sees_little, "note")
+    sees_much = check_clouds(write(tmp_path / "m.las", hills(2, 60_000)), target)
+    assert "ground-unseen" not in codes(sees_much, "note")
+
+
+def test_a_local_target_gives_a_result_without_a_crs(tmp_path):
+    source, target = (
+        write(tmp_path / "s.las", hills(1)),
+        write(tmp_path / "t.las", hills(2, place=np.zeros(3)), None),
+    )
+    assert "target-local" in codes(check_clouds(source, target, target_crs="local"), "note")
+    assert "target-local" not in codes(check_clouds(target, source, source_crs="local"), "note")
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "roles"),
+    [
+        ("forest_plot_mls_uas", {"source_crs": "local"}, {"vertical-unknown"}),
+        ("forest_plot_mls_uas", {"source_crs": "EPSG:6341+5703"}, set()),
+        ("robot_scans", {"local": True}, {"leans"}),
+        ("suburb_dense_ign770", {}, set()),
+        ("bcts_forest_strips", {}, set()),
+    ],
+)
+def test_small_and_wooded_real_pairs_raise_no_false_alarm(name, words, roles, shared_data):
+    folder = shared_data / name
+    report = check_clouds(folder / "source.laz", folder / "target.laz", **words)
+    about_files = {"gps-time", "wkt-bit-unset"}
+    assert codes(report, "error") == codes(report, "warning") == []
+    assert set(codes(report, "note")) - about_files <= roles
+
+
+def test_points_where_nothing_returned_are_found(shared_data):
+    folder = shared_data / "robot_scans"
+    report = check_clouds(folder / "source.laz", folder / "target_with_zero_returns.laz", local=True)
+    assert codes(report, "warning") == ["piled"]

@@ -23,6 +23,7 @@ RARE = {
     "frames",  # null where no pair was made
     "metrics",  # empty where there is no verdict
     "metrics.vertical_offset_m",
+    *(f"rivals[].{key}" for key in ("east_m", "north_m", "turn_deg", "margin", "far")),  # on doubtful sites
     "mtpcr.focus why",
     "mtpcr.level <role>.plane_to_verticals_deg",
     "mtpcr.level <role>.verticals_spread_deg",

@@ -71,5 +71,5 @@ def test_the_sparser_cloud_sets_the_cell() -> None:
 
 
 def test_a_raster_too_large_is_refused_with_the_way_out() -> None:
-    with pytest.raises(RegistrationError, match="coarser --cell"):
+    with pytest.raises(RegistrationError, match="coarser cell"):
         grid_around(np.zeros(2), np.full(2, 1e6), 0.5)

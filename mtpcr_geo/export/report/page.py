@@ -58,7 +58,8 @@ def write_report(
         path: the HTML file to write.
         pair: the registration, in any state.
         done: one entry a finished stage: type, tag, options, seconds, metadata, skipped, failed.
-        facts: what holds for the run: versions, inputs (path, bytes, sha256).
+        facts: what holds for the run: versions, inputs (path, bytes, sha256), and what it wrote (files,
+            withheld, forced).
 
     Raises:
         OutputError: if the file cannot be written.
@@ -66,7 +67,7 @@ def write_report(
     """
     names = f"{Path(pair.source.cloud.name).name} to {Path(pair.target.cloud.name).name}"
     sections = [
-        _head(pair, names),
+        _head(pair, names, facts.get("written")),
         _section("What was found", _found(pair)),
         _section("Pictures", _pictures(pair)),
         _section("How certain it is", _checks(pair)),
@@ -85,7 +86,7 @@ def write_report(
         raise OutputError(f"cannot write the report {path}: {error.strerror}") from error
 
 
-def _head(pair: Pair, names: str) -> str:
+def _head(pair: Pair, names: str, written: Mapping[str, Any] | None) -> str:
     verdict = pair.verdict
     if verdict is None:
         judged = '<div class="verdict none"><b>Not judged</b><p>The run ended before a verdict.</p></div>'
@@ -93,9 +94,16 @@ def _head(pair: Pair, names: str) -> str:
         reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
         judged = (
             f'<div class="verdict {verdict.name}"><b>{verdict.name}</b>'
-            f"<p>{escape(descriptions.verdict_meaning(verdict))}</p><ul>{reasons}</ul></div>"
+            f"<p>{escape(descriptions.verdict_meaning(verdict))}</p><ul>{reasons}</ul>{_left(written)}</div>"
         )
     return f'<h1>{escape(names)}</h1><div class="small">registered with mtpcr_geo {__version__}</div>{judged}'
+
+
+def _left(written: Mapping[str, Any] | None) -> str:
+    """Say which files stand beside the report, and which do not and why."""
+    if written is None:
+        return ""
+    return f'<p class="small">{escape(descriptions.written_text(written))}</p>'
 
 
 def _found(pair: Pair) -> str:

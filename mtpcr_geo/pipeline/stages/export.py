@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -15,6 +16,7 @@ from mtpcr_geo.core.system import peak_memory_mb
 from mtpcr_geo.core.types import Pair, Side, Verdict
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.pipeline.options import Force
+from mtpcr_geo.pipeline.records import Written
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 
 TransformFormat = Literal["json", "cloudcompare", "pdal"]
@@ -27,7 +29,7 @@ class ApplyOptions(StageOptions):
 
 
 class Apply(Stage):
-    """Move the source to the target; nothing comes out when the verdict is refused."""
+    """Move the source to the target; nothing comes out when the verdict withholds that."""
 
     type = "mtpcr.apply"
     Options = ApplyOptions
@@ -40,9 +42,11 @@ class Apply(Stage):
         pair = self.one_pair(inputs)
         if pair.T_target_source is None:
             raise OptionError(f"{self.label} needs a solved pair; put mtpcr.solve before it")
-        if refused(pair) and not self.options.force:
-            self.metadata["skipped"] = "the verdict is refused"
+        withheld = pair.verdict.withholds_cloud if pair.verdict is not None else None
+        if withheld is not None and not self.options.force:
+            self.skipped = withheld
             return None
+        self.forced = withheld is not None
         return moved_source(pair)
 
 
@@ -66,15 +70,19 @@ class EvidenceWriter(Stage):
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Write the file if the pair holds what it needs."""
         if not inputs and context.failure is not None:
-            self.metadata["skipped"] = "no pair was made"
+            self._skip("no pair was made")
             return None
         pair = self.one_pair(inputs)
         missing = self.missing(pair, context)
         if missing:
-            self.metadata["skipped"] = missing
+            self._skip(missing)
         else:
             self.write(pair, context)
         return pair
+
+    def _skip(self, why: str) -> None:
+        self.skipped = why
+        self.not_written |= dict.fromkeys(self.writes(), why)
 
     def missing(self, pair: Pair, context: RunContext) -> str | None:
         """Say what keeps this writer from writing, if anything does."""
@@ -92,6 +100,7 @@ class BevFileOptions(FileOptions):
         description="file to write; a # in it stands for 'source', 'target' and, once the pair is "
         "solved, 'registered': the source's raster laid over the target's"
     )
+    force: Force = False
 
 
 class WriteBev(EvidenceWriter):
@@ -100,6 +109,7 @@ class WriteBev(EvidenceWriter):
     type: ClassVar[str] = "mtpcr.write_bev"
 
     Options: ClassVar[OptionsModel] = BevFileOptions
+    options: BevFileOptions
 
     def writes(self) -> list[Path]:
         """Name both files, or the one."""
@@ -122,8 +132,17 @@ class WriteBev(EvidenceWriter):
             )
         for side in sides:
             write_side_bev(context.outputs.path(self._file(side.role)), side, pair.frame)
-        if len(sides) > 1 and pair.T_target_source is not None and not refused(pair):
-            write_registered_bev(context.outputs.path(self._file("registered")), pair)
+        if "#" not in self.options.filename.name:
+            return
+        file = self._file("registered")
+        withheld = pair.verdict.withholds_transform if pair.verdict is not None else None
+        if len(sides) < 2 or pair.T_target_source is None:
+            self.not_written[file] = "no transform was found"
+        elif withheld is not None and not self.options.force:
+            self.not_written[file] = withheld
+        else:
+            self.forced = withheld is not None
+            write_registered_bev(context.outputs.path(file), pair)
 
     def _file(self, role: str) -> Path:
         return self.options.filename.with_name(self.options.filename.name.replace("#", role))
@@ -172,24 +191,28 @@ class WriteTransform(EvidenceWriter):
         """Need a transform that was not refused."""
         if pair.T_target_source is None:
             return "no transform was found"
-        if refused(pair) and not self.options.force:
-            return "the verdict is refused"
+        if pair.verdict is not None and not self.options.force:
+            return pair.verdict.withholds_transform
         return None
 
     def write(self, pair: Pair, context: RunContext) -> None:
         """Write the file in its format."""
+        # what a file says of itself holds for the set that it is part of
+        self.forced = (
+            pair.verdict is not None and pair.verdict.withholds_cloud is not None and self.options.force
+        )
         from mtpcr_geo.export.transform import (
             write_cloudcompare_matrix,
             write_pdal_pipeline,
             write_transform_json,
         )
 
-        write = {
-            "json": write_transform_json,
-            "cloudcompare": write_cloudcompare_matrix,
-            "pdal": write_pdal_pipeline,
-        }[self.format]
-        write(context.outputs.path(self.options.filename), pair)
+        path = context.outputs.path(self.options.filename)
+        if self.format == "json":
+            write_transform_json(path, pair, forced=self.forced)
+        else:
+            write = {"cloudcompare": write_cloudcompare_matrix, "pdal": write_pdal_pipeline}[self.format]
+            write(path, pair)
 
     @property
     def format(self) -> TransformFormat:
@@ -233,7 +256,10 @@ class WriteReport(EvidenceWriter):
         from mtpcr_geo.export.report.page import write_report
 
         done = [record.audit() for record in context.done]
-        write_report(context.outputs.path(self.options.filename), pair, done, context.facts.audit())
+        path = context.outputs.path(self.options.filename)
+        written = Written.of(context.done, context.outputs.written())
+        facts = {**context.facts.audit(), "written": written.audit()}
+        write_report(path, pair, done, facts)
 
 
 class WriteRun(EvidenceWriter):
@@ -252,11 +278,6 @@ class WriteRun(EvidenceWriter):
         return pair
 
 
-def refused(pair: Pair) -> bool:
-    """Return whether the verdict is refused."""
-    return pair.verdict is not None and pair.verdict.name == "refused"
-
-
 def run_facts(pair: Pair | None, context: RunContext) -> dict[str, Any]:
     """Gather what is known about a run near its end."""
     verdict = pair.verdict if pair else None
@@ -265,10 +286,12 @@ def run_facts(pair: Pair | None, context: RunContext) -> dict[str, Any]:
     from mtpcr_geo.export.transform import frames_of
 
     facts = context.facts.audit()
+    written = Written.of(context.done, context.outputs.written()).audit()
     seconds = {record.tag: round(record.seconds, 4) for record in context.done}
     return {
         "verdict": verdict.name if verdict else None,
         "reasons": list(verdict.reasons) if verdict else [],
+        "rivals": [asdict(rival) for rival in verdict.rivals] if verdict else [],
         "metrics": verdict.metrics if verdict else {},
         # whether to use it is the verdict's to say
         "T_target_source": TransformChain.of(pair).T_file
@@ -282,5 +305,7 @@ def run_facts(pair: Pair | None, context: RunContext) -> dict[str, Any]:
         "pipeline": facts["pipeline"],
         "versions": facts["versions"],
         "inputs": facts["inputs"],
-        "outputs": [str(path) for path in context.outputs.written()],
+        "outputs": written["files"],
+        "not_written": written["withheld"],
+        "forced": written["forced"],
     }

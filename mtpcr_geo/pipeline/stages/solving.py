@@ -11,7 +11,7 @@ from pydantic import Field
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
-from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.errors import OptionError, RegistrationError
 from mtpcr_geo.core.types import Pair, SolveSettings
 from mtpcr_geo.method.scales import tolerance_for
 from mtpcr_geo.pipeline.options import Motion, Seed
@@ -107,17 +107,22 @@ class Solve(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Solve in levelled coordinates, and compose both levelling rotations into the result."""
+        from mtpcr_geo.method.shortcomings import what_is_missing
         from mtpcr_geo.method.solve import solve_tie_points
 
         pair = self.one_pair(inputs)
-        bevs_of(self, pair)
+        rasters = bevs_of(self, pair)
         if pair.tie_points is None:
             raise OptionError(f"{self.label} needs tie points; put mtpcr.inverse_mapping before it")
         tie_points = pair.tie_points
         tolerance = self.options.tolerance or 1.5 * tolerance_for(pair.cell)
         options = self.options
         settings = SolveSettings(options.robust_start, options.upright, options.tries, options.seed)
-        solution, inlier = solve_tie_points(tie_points, tolerance, settings)
+        try:
+            solution, inlier = solve_tie_points(tie_points, tolerance, settings)
+        except RegistrationError as error:
+            what, _, advice = str(error).partition("; ")
+            raise RegistrationError(f"{what}; {what_is_missing(*rasters) or advice}") from error
         T_work_level = transforms.inverse(pair.target.T_level_work)
         T = T_work_level @ solution.T @ pair.source.T_level_work
         self.metadata |= solution.audit()

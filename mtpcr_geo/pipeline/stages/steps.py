@@ -177,14 +177,14 @@ def writers_of(
 
     Args:
         folder: where the files go.
-        force: write cloud and transform though the verdict is refused.
+        force: write cloud, transform and the registered raster though the verdict withholds them.
         recorded: record the run.
         recording: a recording of it that is there already.
 
     """
     where = {name: folder / file for name, file in OUTPUT_NAMES.items()}
     stages: list[Stage] = [
-        WriteBev(BevFileOptions(filename=where["bev"]), "rasters"),
+        WriteBev(BevFileOptions(filename=where["bev"], force=force), "rasters"),
         WriteTiePoints(FileOptions(filename=where["tie_points"]), "tie_points"),
     ]
     for tag in ("transform", "matrix", "pdal"):
