@@ -10,7 +10,7 @@ from mtpcr_geo.cli.shared import progress_bars
 
 
 def run(options: ApplyVerb) -> None:
-    """Move a cloud by the transform of a registration, streamed; warn where that was not accepted.
+    """Move a cloud by the transform of a registration, streamed.
 
     Examples:
         mtpcr-geo apply out/transform.json another_scan.laz moved.laz

@@ -562,7 +562,7 @@ def test_one_match_is_refused_by_the_solver():
     from mtpcr_geo.method.solve import solve_tie_points
 
     one, no = np.zeros((1, 3)), np.zeros(1, bool)
-    with pytest.raises(RegistrationError, match="only 1 tie points"):
+    with pytest.raises(RegistrationError, match="only 1 tie point found"):
         solve_tie_points(TiePoints(one, one, np.ones(1), np.ones(1, np.int64), no, ~no), 1.0)
 
 
