@@ -31,6 +31,8 @@ FINE_DISTANCE_VOXELS = 2.0
 FINE_POINTS = 2
 SAME_FIT = 1.02
 """Times that the surface residual may grow where the height is taken from the ground after ICP."""
+UPRIGHT = 1e-9
+"""Largest entry in which the rotation of both levellings differs from none where both clouds are upright."""
 CLEARLY = 1.01
 """Times that the residual after ICP must exceed a start's for the start to be taken: on bare, sparse ground
 they are equal but for chance, and results would jump with it."""
@@ -77,6 +79,9 @@ def refine(
 ) -> Refinement:
     """Refine a transform by ICP on the overlap, with the height settled on the ground.
 
+    Where both clouds are upright it is the smaller one that moves, whichever is the source, so that source
+    and target exchanged give the inverse.
+
     Args:
         source, target: (n, 3) and (m, 3) work coordinates, metres.
         T_start: 4x4 from source to target, a metre or two from the truth.
@@ -91,6 +96,55 @@ def refine(
         RegistrationError: if the clouds hardly overlap under the start.
 
     """
+    upright = R_upright is None or bool(np.abs(R_upright - np.eye(3)).max() < UPRIGHT)
+    if upright and len(source) > len(target):
+        back = _refine(
+            target,
+            source,
+            transforms.inverse(T_start),
+            settings,
+            cell,
+            lambda T: agreeing(transforms.inverse(T)),
+        )
+        found = inverse_of(back)
+    else:
+        found = _refine(source, target, T_start, settings, cell, agreeing)
+    if settings.motion == "rigid":
+        return found
+    middle = source.mean(axis=0) if pivot is None else pivot
+    T = constrain(found.T, settings.motion, middle, np.eye(3) if R_upright is None else R_upright)
+    return replace(found, T=T)
+
+
+def inverse_of(refinement: Refinement) -> Refinement:
+    """Return what a refinement says of the inverse transform."""
+    ground = [
+        None
+        if fit is None
+        else replace(fit, T=transforms.inverse(fit.T), rise_m=None if fit.rise_m is None else -fit.rise_m)
+        for fit in (refinement.ground_before, refinement.ground_after)
+    ]
+    icp = refinement.icp
+    if icp is not None:
+        icp = replace(
+            icp,
+            T=transforms.inverse(icp.T),
+            points_source=icp.points_target,
+            points_target=icp.points_source,
+        )
+    before = transforms.inverse(refinement.T_before)
+    return Refinement(transforms.inverse(refinement.T), before, ground[0], icp, ground[1])
+
+
+def _refine(
+    source: Floats,
+    target: Floats,
+    T_start: Floats,
+    settings: RefineSettings,
+    cell: float,
+    agreeing: Callable[[Floats], int],
+) -> Refinement:
+    """Refine with all six degrees of freedom, the smaller cloud as the source."""
     T, ground_before, icp, ground_after = T_start, None, None, None
     surfaces: Surfaces | None = None
     starts = {"tie_points": T}
@@ -133,9 +187,6 @@ def refine(
         )
         ground_after = replace(ground_after, followed=followed)
         T = ground_after.T if followed else T
-    if settings.motion != "rigid":
-        middle = source.mean(axis=0) if pivot is None else pivot
-        T = constrain(T, settings.motion, middle, np.eye(3) if R_upright is None else R_upright)
     return Refinement(T, T_start, ground_before, icp, ground_after)
 
 
