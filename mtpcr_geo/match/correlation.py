@@ -89,6 +89,9 @@ def match(
 ) -> Matches:
     """Match two height rasters of unknown relative yaw and shift.
 
+    Where nothing is known of the pose it is the raster of fewer filled cells that is turned and moved,
+    whichever is the source: source and target exchanged give the inverse.
+
     Args:
         source, target: rasters of one cell size, in levelled coordinates.
         settings: what governs the search.
@@ -103,6 +106,8 @@ def match(
         RegistrationError: if the rasters are too small or too empty to overlap enough.
 
     """
+    if prior is None and (source.count > 0).sum() > (target.count > 0).sum():
+        return exchanged(match(target, source, settings, seed, advance))
     scales = scales_of(source, target)
     search = _Search(source, target, scales, settings, seed, advance, prior)
     twin = None
@@ -166,6 +171,22 @@ def match(
         null_ratio=null_ratio,
         strength=best.strength,
         report=report,
+    )
+
+
+def exchanged(matches: Matches) -> Matches:
+    """Return the matches of the target to the source as those of the source to the target."""
+    hypotheses = []
+    for one in matches.hypotheses:
+        c, s = np.cos(one.yaw), np.sin(one.yaw)
+        east, north = one.shift
+        back = (float(-(c * east + s * north)), float(s * east - c * north))
+        hypotheses.append(replace(one, yaw=-one.yaw, shift=back))
+    return replace(
+        matches,
+        source_px=matches.target_px,
+        target_px=matches.source_px,
+        hypotheses=tuple(hypotheses),
     )
 
 

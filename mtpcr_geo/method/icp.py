@@ -168,9 +168,11 @@ class Surfaces:
             done.append(
                 IcpRound(distance, int(result.iterations), int(result.num_inliers), bool(result.converged))
             )
-        X[:3, :3] = transforms.orthonormal(X[:3, :3])
-        T = transforms.translation(self._pivot) @ X @ transforms.translation(-self._pivot) @ self.T_start
-        return Descent(T, tuple(done))
+        return Descent(self._absolute(X), tuple(done))
+
+    def between(self, A: Floats, B: Floats) -> Floats:
+        """Return the transform halfway between two that hardly differ, 4x4 each."""
+        return self._absolute((self._relative(A) + self._relative(B)) / 2.0)
 
     def surface_residual(self, T: Floats) -> float:
         """Return how badly flat surfaces of the source meet the target: 0 all meet, 1 none does.
@@ -219,6 +221,12 @@ class Surfaces:
         spread, axes = local_shapes(self._source_tree, self._s, self._s[chosen], NEIGHBOURS, self._threads)
         flat = spread[:, 1] > FLAT * spread[:, 0]
         return self._s[chosen[flat]], axes[flat, :, 0]
+
+    def _absolute(self, X: Floats) -> Floats:
+        """Express what is left after the start, about the pivot, as a transform."""
+        X = X.copy()
+        X[:3, :3] = transforms.orthonormal(X[:3, :3])
+        return transforms.translation(self._pivot) @ X @ transforms.translation(-self._pivot) @ self.T_start
 
     def _relative(self, T: Floats) -> Floats:
         """Express a transform as what is left after the start, about the pivot."""

@@ -68,9 +68,9 @@ def tie_points_of(
 ) -> TiePoints:
     """Map matches back to 3D (Eq. 5), and hold some out to judge the result by.
 
-    The target is divided into square blocks, and all tie points of a block go into the same fold, so that
-    those held out are not neighbours of those the transform is solved from. Matches without a height in
-    either raster are left out.
+    The raster of more filled cells is divided into square blocks, and all tie points of a block go into the
+    same fold, so that those held out are not neighbours of those the transform is solved from. Matches
+    without a height in either raster are left out.
 
     Args:
         matches: pixel pairs.
@@ -89,8 +89,10 @@ def tie_points_of(
     t = inverse_mapping(matches.target_px, target, surface=surface, pixel=pixel)
     known = np.isfinite(s[:, 2]) & np.isfinite(t[:, 2])
     s, t, score = s[known], t[known], matches.score[known]
-    block = block_for(t[:, :2], target.grid.cell) if block_m is None else block_m
-    fold = folds_of(t[:, :2], folds, block, seed)
+    # by the same raster whichever is the source, so that both ways round the same are held out
+    xy = (s if (source.count > 0).sum() > (target.count > 0).sum() else t)[:, :2]
+    block = block_for(xy, target.grid.cell) if block_m is None else block_m
+    fold = folds_of(xy, folds, block, seed)
     return TiePoints(s, t, score, fold, fold == 0, np.ones(len(s), bool))
 
 

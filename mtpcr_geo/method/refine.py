@@ -11,7 +11,7 @@ import numpy as np
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.types import GroundFit, IcpMethod, IcpResult, IcpRound, IcpTrial, Refinement
-from mtpcr_geo.method.icp import Rounds, Surfaces, rounds_for
+from mtpcr_geo.method.icp import Descent, Rounds, Surfaces, rounds_for
 from mtpcr_geo.method.overlap import OVERLAP_CELL_M, Overlap, overlap_of
 from mtpcr_geo.method.scales import ground_cell_for
 
@@ -31,6 +31,8 @@ FINE_DISTANCE_VOXELS = 2.0
 FINE_POINTS = 2
 SAME_FIT = 1.02
 """Times that the surface residual may grow where the height is taken from the ground after ICP."""
+BETWEEN = "between"
+"""Name of the pose halfway between what ICP came to from far and from near."""
 UPRIGHT = 1e-9
 """Largest entry in which the rotation of both levellings differs from none where both clouds are upright."""
 CLEARLY = 1.01
@@ -280,19 +282,33 @@ def follow_icp(
     tried = {name: T for name, T in starts.items() if keep_tie_points > 0} | {
         name: run.T for name, run in runs.items()
     }
+    if len(runs) == 2:
+        # sparse clouds leave ICP several places to end in, and which of them fits best is luck
+        tried[BETWEEN] = surfaces.between(*(run.T for run in runs.values()))
     wanted = keep_tie_points * agreeing(starts[last])
     trials = {name: IcpTrial(surfaces.surface_residual(T), agreeing(T)) for name, T in tried.items()}
     kept = [name for name in tried if name == last or trials[name].tie_points >= wanted]
-    best = min(kept, key=lambda name: trials[name].surface_residual * (1.0 if name in runs else CLEARLY))
+    best = min(
+        (name for name in kept if name != BETWEEN),
+        key=lambda name: trials[name].surface_residual * (1.0 if name in runs else CLEARLY),
+    )
     lost = [
         name
         for name in runs
         if name not in kept and trials[name].surface_residual < trials[best].surface_residual
     ]
-    run = runs.get(best)
+    if (
+        best in runs
+        and BETWEEN in kept
+        and (trials[BETWEEN].surface_residual <= CLEARLY * trials[best].surface_residual)
+    ):
+        run: Descent | None = runs[best]
+        best = BETWEEN
+    else:
+        run = runs.get(best)
     rotated = None
     if run is not None:
-        rotation = run.T[:3, :3] @ starts[last][:3, :3].T
+        rotation = tried[best][:3, :3] @ starts[last][:3, :3].T
         rotated = float(np.degrees(transforms.rotation_angle(rotation)))
     return IcpResult(
         T=tried[best],
