@@ -145,8 +145,9 @@ PriorPose = Annotated[
     ),
     Shown(PRIOR, ("--prior",), metavar="none|georef|FILE"),
 ]
+Coordinate = Annotated[float, Field(allow_inf_nan=False)]
 Near = Annotated[
-    tuple[float, float] | None,
+    tuple[Coordinate, Coordinate] | None,
     BeforeValidator(_plain),
     Field(
         description="place in the target's CRS near which the middle of the source lies (the mean of its "
@@ -396,7 +397,7 @@ def first_problem(error: ValidationError, model: type[BaseModel], spelt: Callabl
     names = [field.alias or key for key, field in model.model_fields.items()]
     if problem["type"] == "extra_forbidden":
         return f"no option {spelt(name)}{meant(name, names)}"
-    if problem["type"] == "missing":
+    if problem["type"] == "missing" and len(problem["loc"]) == 1:
         return f"the option {spelt(name)} is missing"
     message = problem["msg"].removeprefix("Value error, ")
     if not problem["loc"]:  # several options that do not go together
