@@ -96,6 +96,11 @@ class MatchOptions(StageOptions):
     prior: PriorKind = "none"
     prior_sigma: PriorSigma = 5.0
     prior_yaw: PriorYaw = 5.0
+    verticals: bool = Field(
+        True,
+        description="where a vertical is not known and the matches under the likeliest one do not convince: "
+        "level, rasterise and match again under others, and keep the strongest",
+    )
     models: Models = None
     turns: int = Field(
         8, ge=1, le=72, description="orientations in which learned matchers are tried, round the circle"
@@ -159,8 +164,27 @@ class Match(Stage):
             self._matcher = self._make(None)
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
-        """Match the source's raster to the target's."""
+        """Match the source's raster to the target's; under several verticals where none is known."""
+        from mtpcr_geo.pipeline.stages.hypotheses import best_vertical
+        from mtpcr_geo.pipeline.stages.rasters import with_rasters
+
         pair = self.one_pair(inputs)
+        bevs_of(self, pair)
+        if not self.options.verticals or pair.raster is None or self.options.prior != "none":
+            return self._matched(pair, context)
+        raster = pair.raster
+        pair, tried = best_vertical(
+            pair,
+            self.options.seed,
+            lambda one: self._matched(one, context),
+            lambda one: self._matched(with_rasters(one, raster, context)[0], context),
+        )
+        if tried:
+            assert pair.matches is not None
+            self.metadata |= {"matches": len(pair.matches), **pair.matches.report, "verticals": tried}
+        return pair
+
+    def _matched(self, pair: Pair, context: RunContext) -> Pair:
         source, target = bevs_of(self, pair)
         prior = self._prior(pair)
         trusted = pair.source.levelling.trusted and pair.target.levelling.trusted

@@ -114,7 +114,8 @@ def _method(options: MethodOptions, prefix: str) -> list[Stage]:
 def _match_options(options: MethodOptions, matcher: str) -> MatchOptions:
     models = None if matcher == "correlation" else options.models
     if options.prior == "none":
-        return MatchOptions(method=matcher, models=models, seed=options.seed)
+        tried = options.level == "auto"
+        return MatchOptions(method=matcher, models=models, verticals=tried, seed=options.seed)
     return MatchOptions(
         method=matcher,
         models=models,
