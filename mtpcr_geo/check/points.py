@@ -117,6 +117,21 @@ def noise_findings(scan: Scan, role: Role) -> Iterator[Finding]:
         )
 
 
+def no_return_findings(scan: Scan, role: Role) -> Iterator[Finding]:
+    """Yield points that mark beams without a return."""
+    if scan.no_returns:
+        where = "; ".join(
+            "(" + ", ".join(f"{v:g}" for v in place) + ")" for place in scan.no_return_places[:3]
+        )
+        yield Finding(
+            "note",
+            "no-returns",
+            role,
+            f"{scan.no_returns:,} of its points ({scan.no_returns / scan.count:.1%}) lie exactly at {where}: "
+            "beams without a return; they are kept in what is written, and left out of all else",
+        )
+
+
 def density_findings(measured: Measured, count: int, role: Role) -> Iterator[Finding]:
     """Yield whether points are too few or too sparse to show shapes."""
     if measured.per_m2 < SPARSE_PER_M2:

@@ -159,6 +159,7 @@ class _Check:
         if inspection.scan is None:
             return
         found += points.noise_findings(inspection.scan, role)
+        found += points.no_return_findings(inspection.scan, role)
         try:
             _, link, _ = resolve_frames(cloud, cloud, target_crs=declared, source_crs=declared, local=local)
             sample = link.to_work(inspection.scan.sample)

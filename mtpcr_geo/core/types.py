@@ -140,10 +140,14 @@ class Side(ComparesArrays):
         cloud: the cloud as read.
         link: takes its file coordinates to its work coordinates (metric, near zero) and back.
         sample: (n, 3) float64 work coordinates, at most the budget; the whole cloud where it fits.
-        complete: whether the sample is the whole cloud.
+        complete: whether the sample is the whole cloud but for noise and no returns.
         levelling: how it was made upright.
         bev: its height raster, in levelled coordinates.
         appearance: the image made of the raster, where one was asked for.
+        bounds: (2, 3) least and greatest file coordinates without noise and no returns; None to take the
+            header's.
+        no_returns: points that mark beams without a return: kept in what is written, and in nothing else.
+        no_return_places: (k, 3) file coordinates where these are.
 
     """
 
@@ -155,6 +159,9 @@ class Side(ComparesArrays):
     levelling: Levelling = field(default_factory=Levelling)
     bev: Bev | None = None
     appearance: Appearance | None = None
+    bounds: Floats | None = None
+    no_returns: int = 0
+    no_return_places: Floats = field(default_factory=lambda: np.empty((0, 3)))
 
     @property
     def T_level_work(self) -> Floats:

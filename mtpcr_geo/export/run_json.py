@@ -85,6 +85,8 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.level <role>.points``: points read
 - ``mtpcr.level <role>.noise_points``: of these, classified as noise (7, 18) or flagged withheld, and left
   out
+- ``mtpcr.level <role>.no_return_points``: points that mark beams without a return, all on exactly one place:
+  kept in what is written, left out of everything else
 - ``mtpcr.level <role>.sampled``: points kept to work on
 - ``mtpcr.level <role>.method``: none, plane, floor, verticals or refinement: what the cloud was levelled by
 - ``mtpcr.level <role>.tilt_deg``: angle between its z axis and the vertical found

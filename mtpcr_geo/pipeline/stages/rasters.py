@@ -106,10 +106,24 @@ class Level(Stage):
             self.metadata[role] = {
                 "points": scanned.count,
                 "noise_points": scanned.dropped,
+                "no_return_points": scanned.no_returns,
                 "sampled": len(scanned.sample),
                 **levelling.audit(),
             }
-            sides.append(Side(role, cloud, link, sample, scanned.complete, levelling))
+            bounds = np.stack([scanned.minimum, scanned.maximum])
+            sides.append(
+                Side(
+                    role,
+                    cloud,
+                    link,
+                    sample,
+                    scanned.complete,
+                    levelling,
+                    bounds=bounds,
+                    no_returns=scanned.no_returns,
+                    no_return_places=scanned.no_return_places,
+                )
+            )
         return Pair(sides[0], sides[-1], frame)
 
 
@@ -207,7 +221,7 @@ def with_rasters(
 
 
 def _coverage(side: Side) -> Coverage:
-    return coverage_of(side.sample, side.levelled_sample, side.cloud.count)
+    return coverage_of(side.levelled_sample, points=side.cloud.count - side.no_returns)
 
 
 def rasterised(side: Side, cell: float, convention: Convention, context: RunContext) -> Bev:
@@ -223,14 +237,14 @@ def _levelled_chunks(side: Side, context: RunContext) -> Iterator[Floats]:
     from mtpcr_geo.io.sample import surface_chunks
 
     with context.progress.task(f"rasterising {side.cloud.name}", side.cloud.count) as advance:
-        for xyz in surface_chunks(side.cloud):
+        for xyz in surface_chunks(side.cloud, places=side.no_return_places):
             yield transforms.apply(side.T_level_work, in_work_frame(side.link, xyz))
             advance(len(xyz))
 
 
 def _levelled_bounds(side: Side) -> tuple[Floats, Floats]:
     """Bounds of the whole cloud once levelled, from the corners of its box: a little generous."""
-    low, high = side.cloud.minimum, side.cloud.maximum
+    low, high = (side.cloud.minimum, side.cloud.maximum) if side.bounds is None else side.bounds
     corners = np.array(
         [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
     )
