@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mtpcr_geo.check import header, pair, place, points
+from mtpcr_geo.check import header, pair, place, points, upright
 from mtpcr_geo.check.describe import CloudFacts, describe
 from mtpcr_geo.check.findings import CloudRole, Finding, Role, by_severity, finding_of
 from mtpcr_geo.check.inspection import Inspection
@@ -178,6 +178,8 @@ class _Check:
         )
         found += points.density_findings(inspection.measured, cloud.count, role)
         found += points.plan_findings(inspection.measured, role)
+        if inspection.is_local:
+            found += upright.upright_findings(sample, role)
         if claim.facts is not None and claim.facts.kind != "geocentric":
             stated = claim.facts.georeferenced
             found += points.height_findings(inspection.measured, claim.facts.height_unit_name, stated, role)

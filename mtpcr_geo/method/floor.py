@@ -41,6 +41,8 @@ class Floor:
         share: of the cells seen.
         spread_m: robust spread of the lowest points about it, metres.
         extent_m: of the cloud, metres.
+        above: of the points well off the plane, the share above it; 1/2 where there are none. On a plain it
+            alone tells up from down.
 
     """
 
@@ -49,11 +51,12 @@ class Floor:
     share: float
     spread_m: float
     extent_m: float
+    above: float
 
     @property
     def quality(self) -> float:
-        """Area over unevenness: what floors are ranked by."""
-        return self.cells / (self.spread_m / self.extent_m + LEAST_UNEVEN)
+        """Area over unevenness, times the share above it: what floors are ranked by."""
+        return self.cells * self.above / (self.spread_m / self.extent_m + LEAST_UNEVEN)
 
 
 def extent_of(xyz: Floats) -> float:
@@ -79,18 +82,22 @@ def floor_along(xyz: Floats, about: Floats, extent: float) -> Floor:
     xyz = xyz - xyz.mean(axis=0)
     cell, near = extent / CELLS_ACROSS, extent * NEAR_PER_EXTENT
     up = about
-    found = Floor(about, 0, 0.0, float("inf"), extent)
+    found = Floor(about, 0, 0.0, float("inf"), extent, 0.5)
     for _ in range(ROUNDS):
         R = rotation_to_up(up)
         lowest = _lowest(xyz @ R.T, cell)
         if len(lowest) < FEWEST_CELLS:
             return found
-        slope, rest = _plane(lowest, extent)
+        slope, level, rest = _plane(lowest, extent)
         on = np.abs(rest) < near
         spread = 1.4826 * float(np.median(np.abs(rest)))
         normal = np.array([-slope[0], -slope[1], 1.0])
         new = R.T @ (normal / np.linalg.norm(normal))
-        found = Floor(new, int(on.sum()), float(on.mean()), spread, extent)
+        well_off = max(4.0 * spread, LEAST_UNEVEN * extent)
+        height = (xyz @ R.T) @ normal - level
+        above, below = (height > well_off).sum(), (height < -well_off).sum()
+        share = float((above + 1) / (above + below + 2))
+        found = Floor(new, int(on.sum()), float(on.mean()), spread, extent, share)
         moved, up = angle_deg(up, new), new
         if moved < STILL_DEG:
             break
@@ -109,8 +116,8 @@ def _lowest(xyz: Floats, cell: float) -> Floats:
     return np.asarray(xyz[order[first]])
 
 
-def _plane(lowest: Floats, extent: float) -> tuple[Floats, Floats]:
-    """Fit a plane to lowest points: its slope (2,), and (m,) their heights above it.
+def _plane(lowest: Floats, extent: float) -> tuple[Floats, float, Floats]:
+    """Fit a plane to lowest points: its slope (2,), its height at the origin, and (m,) heights above it.
 
     What lies above it counts less than what lies below: cells that see no ground show canopy or a roof.
     """
@@ -124,7 +131,7 @@ def _plane(lowest: Floats, extent: float) -> tuple[Floats, Floats]:
         rest = np.asarray(lowest[:, 2] - A @ x, np.float64)
         scale = max(1.4826 * float(np.median(np.abs(rest))), 1e-4 * extent)
         weight = 1.0 / (1.0 + (np.where(rest > 0, rest, rest / 2.0) / scale) ** 2)
-    return x[1:], np.asarray(rest)
+    return x[1:], float(x[0]), rest
 
 
 def floors_of(xyz: Floats, extent: float, rng: np.random.Generator) -> tuple[Floor, ...]:
