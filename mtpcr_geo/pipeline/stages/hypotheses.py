@@ -19,7 +19,7 @@ MOST_TRIED = 5
 """Pairs of verticals tried at most: each costs as much as the first search."""
 STEEPEST_DEG = 40.0
 """Slope of the floor up to which a cloud of known vertical is levelled by it, for the other's sake."""
-CONVINCING_MARGIN, CONVINCING_NULL_RATIO = 1.5, 2.0
+CONVINCING_MARGIN, CONVINCING_NULL_RATIO = 1.5, 1.8
 """Strength over the next distinct hypothesis, and over the mirrored source's best, from which on no other
 vertical is tried. Both are a little above what the verdict wants to accept."""
 
