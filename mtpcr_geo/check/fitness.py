@@ -9,6 +9,7 @@ import numpy as np
 
 from mtpcr_geo.check.findings import Finding, Role
 from mtpcr_geo.check.points import Measured
+from mtpcr_geo.check.upright import TILTED_DEG
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.types import Bev
 from mtpcr_geo.method.bev import choose_cell, make_bev
@@ -117,7 +118,7 @@ def vertical_findings(side: Fitness) -> Iterator[Finding]:
             "only be found later, by the refinement",
             f"name its CRS (--{side.role}-crs) if it has one; --level none if it is upright",
         )
-    elif found.tilt_deg >= LEANS_DEG:
+    elif LEANS_DEG <= found.tilt_deg < TILTED_DEG:
         by = {"plane": "its ground plane", "verticals": "its walls, poles and trunks"}.get(
             found.method, "itself"
         )

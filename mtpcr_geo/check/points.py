@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 
 MUCH_NOISE, VERY_MUCH_NOISE = 0.05, 0.3
-PROBED, PILED = 20_000, 0.01
 TALLEST_M = 1500.0
 TALLEST_GROWN_OR_BUILT_M = 120.0
 """Trees grow no higher, and few buildings: a plot may well be narrower than what stands on it is high."""
@@ -118,20 +117,18 @@ def noise_findings(scan: Scan, role: Role) -> Iterator[Finding]:
         )
 
 
-def piled_findings(scan: Scan, role: Role) -> Iterator[Finding]:
-    """Yield whether many points lie at one place: scanners write zeros where nothing returned."""
-    few = scan.sample[:: max(1, len(scan.sample) // PROBED)]
-    places, counts = np.unique(few, axis=0, return_counts=True)
-    most = int(counts.argmax())
-    share = float(counts[most]) / len(few)
-    if share > PILED:
-        place = ", ".join(f"{value + 0.0:g}" for value in places[most])
+def no_return_findings(scan: Scan, role: Role) -> Iterator[Finding]:
+    """Yield points that mark beams without a return."""
+    if scan.no_returns:
+        where = "; ".join(
+            "(" + ", ".join(f"{v:g}" for v in place) + ")" for place in scan.no_return_places[:3]
+        )
         yield Finding(
-            "warning",
-            "piled",
+            "note",
+            "no-returns",
             role,
-            f"{share:.0%} of its points lie at one and the same place ({place}), as where nothing returned",
-            "remove them: filters.crop in a pipeline does it, or export the cloud without them",
+            f"{scan.no_returns:,} of its points ({scan.no_returns / scan.count:.1%}) lie exactly at {where}: "
+            "beams without a return; they are kept in what is written, and left out of all else",
         )
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mtpcr_geo.check import fitness, header, pair, place, points
+from mtpcr_geo.check import fitness, header, pair, place, points, upright
 from mtpcr_geo.check.describe import CloudFacts, describe
 from mtpcr_geo.check.findings import CloudRole, Finding, Role, by_severity, finding_of
 from mtpcr_geo.check.inspection import Inspection
@@ -176,7 +176,7 @@ class _Check:
         if inspection.scan is None:
             return
         found += points.noise_findings(inspection.scan, role)
-        found += points.piled_findings(inspection.scan, role)
+        found += points.no_return_findings(inspection.scan, role)
         try:
             _, link, _ = resolve_frames(cloud, cloud, target_crs=declared, source_crs=declared, local=local)
             sample = link.to_work(inspection.scan.sample)
@@ -194,6 +194,8 @@ class _Check:
             sample, low, high, float(link.origin[2]), dense.per_m2, dense.occupied_m2
         )
         found += points.plan_findings(inspection.measured, role)
+        if inspection.is_local:
+            found += upright.upright_findings(sample, role)
         if claim.facts is not None and claim.facts.kind != "geocentric":
             stated = claim.facts.georeferenced
             found += points.height_findings(inspection.measured, claim.facts.height_unit_name, stated, role)

@@ -74,6 +74,20 @@ def rotation_angle(R: Matrix) -> float:
     return float(np.arctan2(np.linalg.norm(skew), np.trace(R) - 1.0))
 
 
+def rotation_to_up(up: Points) -> Matrix:
+    """Smallest rotation (3, 3) that takes the unit vector ``up`` (3,) to +z; half a turn about x from -z."""
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-15:
+        return np.eye(3) if up[2] > 0 else np.diag([1.0, -1.0, -1.0])
+    return axis_angle_matrix(axis / sine, float(np.arctan2(sine, up[2])))
+
+
+def angle_deg(a: Points, b: Points) -> float:
+    """Angle between two vectors (3,), degrees, accurate for tiny angles too."""
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+
+
 def yaw_of(R: Matrix) -> float:
     """Yaw of a (3, 3) rotation in radians: the turn about the vertical of its x axis."""
     return float(np.arctan2(R[1, 0], R[0, 0]))

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from mtpcr_geo.core.frames import FrameLink, WorkFrame
 
 VerdictName = Literal["accepted", "doubtful", "refused"]
-LevellingMethod = Literal["none", "plane", "verticals", "refinement"]
+LevellingMethod = Literal["none", "plane", "floor", "verticals", "refinement"]
 Look = Literal["band_pass", "paper", "paper_normalised", "grey", "grey_printed"]
 """How the image of a raster is made that keypoint matchers see, see `mtpcr_geo.method.images.image_of`."""
 
@@ -79,7 +79,8 @@ class Levelling(ComparesArrays):
 
     Attributes:
         T_level_work: 4x4 rotation about the sample's centre, work to levelled coordinates.
-        method: "none", "plane" (the paper), "verticals", or "refinement" where ICP told the vertical.
+        method: "none", "plane" (the paper), "floor" (the lowest points of coarse cells), "verticals", or
+            "refinement" where ICP told the vertical.
         tilt_deg: angle between the cloud's z axis and the vertical found, degrees.
         why: why it was kept as it is, where it was.
         trusted: whether the vertical is known: by the CRS, or since the user says so.
@@ -87,6 +88,8 @@ class Levelling(ComparesArrays):
         verticals: points on walls, poles and trunks that agree on the vertical.
         verticals_spread_deg: their robust spread about it, degrees.
         plane_to_verticals_deg: angle between the plane's normal and the vertical, degrees.
+        floor_tilt_deg, floor_share: tilt of the sheet of lowest points, degrees, and share of the cells
+            whose lowest point lies near it.
 
     """
 
@@ -100,11 +103,33 @@ class Levelling(ComparesArrays):
     verticals: int | None = None
     verticals_spread_deg: float | None = None
     plane_to_verticals_deg: float | None = None
+    floor_tilt_deg: float | None = None
+    floor_share: float | None = None
 
     def audit(self) -> dict[str, Any]:
         """Return everything but the matrix, without what is not known, for the audit."""
         names = [one.name for one in fields(self) if one.name != "T_level_work"]
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """How rasters are made, so that they can be made again under another vertical.
+
+    Attributes:
+        cell: edge of a cell, metres; chosen from the densities if None.
+        finest: no finer cell is chosen than this, metres; None where the extent of the clouds plays a part.
+        resolution: "common" for one cell, "eq1" or "eq1_occupied" for a cell of each cloud's own.
+        gamma: the gamma of Eq. 1, metres; None for the usual one.
+        pixel: which points a cell holds: "centre" or "ceil".
+
+    """
+
+    cell: float | None = None
+    finest: float | None = None
+    resolution: Literal["common", "eq1", "eq1_occupied"] = "common"
+    gamma: float | None = None
+    pixel: Literal["centre", "ceil"] = "centre"
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,10 +141,14 @@ class Side(ComparesArrays):
         cloud: the cloud as read.
         link: takes its file coordinates to its work coordinates (metric, near zero) and back.
         sample: (n, 3) float64 work coordinates, at most the budget; the whole cloud where it fits.
-        complete: whether the sample is the whole cloud.
+        complete: whether the sample is the whole cloud but for noise and no returns.
         levelling: how it was made upright.
         bev: its height raster, in levelled coordinates.
         appearance: the image made of the raster, where one was asked for.
+        bounds: (2, 3) least and greatest file coordinates without noise and no returns; None to take the
+            header's.
+        no_returns: points that mark beams without a return: kept in what is written, and in nothing else.
+        no_return_places: (k, 3) file coordinates where these are.
 
     """
 
@@ -131,6 +160,9 @@ class Side(ComparesArrays):
     levelling: Levelling = field(default_factory=Levelling)
     bev: Bev | None = None
     appearance: Appearance | None = None
+    bounds: Floats | None = None
+    no_returns: int = 0
+    no_return_places: Floats = field(default_factory=lambda: np.empty((0, 3)))
 
     @property
     def T_level_work(self) -> Floats:
@@ -290,6 +322,7 @@ class Pair(ComparesArrays):
     Attributes:
         target, source: the two clouds.
         frame: the work frame (target's).
+        raster: how the rasters were made, once they were.
         matches, tie_points: what links them, once found.
         T_target_source: 4x4 in work coordinates (source work -> target work), once solved.
         solution: how it was solved.
@@ -302,6 +335,7 @@ class Pair(ComparesArrays):
     target: Side
     source: Side
     frame: WorkFrame
+    raster: RasterSettings | None = None
     matches: Matches | None = None
     tie_points: TiePoints | None = None
     T_target_source: Floats | None = None

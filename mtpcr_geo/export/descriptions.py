@@ -94,6 +94,7 @@ def side_rows(side: Side) -> list[Row]:
     rows = [
         ("file", Path(cloud.name).name),
         ("points", f"{cloud.count:,}"),
+        *_no_return_rows(side),
         ("CRS", crs),
         ("units", units_text(side.link)),
         *_operation_rows(side.link),
@@ -108,6 +109,14 @@ def side_rows(side: Side) -> list[Row]:
         share = float(np.count_nonzero(side.bev.count)) / max(side.bev.count.size, 1)
         rows.append(("raster", f"{grid.width} × {grid.height} cells of {grid.cell:g} m, {share:.0%} filled"))
     return rows
+
+
+def _no_return_rows(side: Side) -> list[Row]:
+    if not side.no_returns:
+        return []
+    where = "; ".join(", ".join(f"{value:g}" for value in place) for place in side.no_return_places[:3])
+    text = f"{side.no_returns:,} at {where}: kept in what is written, left out of all else"
+    return [("points without a return", text)]
 
 
 def transform_rows(pair: Pair) -> list[Row]:
@@ -201,7 +210,9 @@ def worked_example(pair: Pair) -> tuple[Floats, Floats] | None:
     """
     if pair.T_target_source is None:
         return None
-    middle = (pair.source.cloud.minimum + pair.source.cloud.maximum) / 2
+    source = pair.source
+    low, high = (source.cloud.minimum, source.cloud.maximum) if source.bounds is None else source.bounds
+    middle = (low + high) / 2
     before: Floats = np.asarray(np.round(middle, 3), np.float64)
     return before, TransformChain.of(pair).forward(before[np.newaxis])[0]
 

@@ -100,13 +100,17 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.level <role>.points``: points read
 - ``mtpcr.level <role>.noise_points``: of these, classified as noise (7, 18) or flagged withheld, and left
   out
+- ``mtpcr.level <role>.no_return_points``: points that mark beams without a return, all on exactly one place:
+  kept in what is written, left out of everything else
 - ``mtpcr.level <role>.sampled``: points kept to work on
-- ``mtpcr.level <role>.method``: none, plane, verticals or refinement: what the cloud was levelled by
+- ``mtpcr.level <role>.method``: none, plane, floor, verticals or refinement: what the cloud was levelled by
 - ``mtpcr.level <role>.tilt_deg``: angle between its z axis and the vertical found
 - ``mtpcr.level <role>.why``: why it was kept as it is, where it was
 - ``mtpcr.level <role>.trusted``: whether its vertical is known: by the CRS, or since the options say so
 - ``mtpcr.level <role>.plane_tilt_deg``: tilt of the ground plane
 - ``mtpcr.level <role>.plane_inlier_share``: share of the points on that plane, 0 to 1
+- ``mtpcr.level <role>.floor_tilt_deg``: tilt of the sheet of lowest points
+- ``mtpcr.level <role>.floor_share``: share of coarse cells whose lowest point lies near it, 0 to 1
 - ``mtpcr.level <role>.verticals``: points on walls, poles and trunks that agree on the vertical
 - ``mtpcr.level <role>.verticals_spread_deg``: their robust spread about it
 - ``mtpcr.level <role>.plane_to_verticals_deg``: angle between the plane's normal and the vertical
@@ -147,6 +151,13 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.match mirrored_strengths``: score times support of the hypotheses of the mirrored source; null where
   it was not searched
 - ``mtpcr.match null_ratio``: score times support of the best hypothesis over the best of these
+- ``mtpcr.match verticals[].source``: what the source was levelled by, where several verticals were tried
+- ``mtpcr.match verticals[].target``: the same of the target
+- ``mtpcr.match verticals[].source_tilt_deg``: tilt of the source's vertical there
+- ``mtpcr.match verticals[].target_tilt_deg``: tilt of the target's
+- ``mtpcr.match verticals[].strength``: of the best hypothesis there; null where nothing was found
+- ``mtpcr.match verticals[].margin``: over the next distinct one
+- ``mtpcr.match verticals[].taken``: whether the run went on from there
 - ``mtpcr.match zoom``: factor by which images were reduced before keypoints were sought
 - ``mtpcr.match turns_deg``: turns of the source that were tried
 - ``mtpcr.match turn_matches``: matches at each of them

@@ -12,6 +12,7 @@ import numpy as np
 from mtpcr_geo.core.arrays import ComparesArrays, Floats
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud
 from mtpcr_geo.core.errors import InputError
+from mtpcr_geo.io.no_returns import NoReturns, without
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.progress import Progress
@@ -27,14 +28,18 @@ class Scan(ComparesArrays):
     Attributes:
         count: points in the cloud.
         dropped: of these, points classified as noise (7, 18) or flagged withheld; not in the sample.
+        no_returns: of the others, points that mark beams without a return; not in the sample either.
+        no_return_places: (k, 3) file coordinates where these are.
         minimum, maximum: (3,) true bounds of all other points, in file coordinates.
         sample: (n, 3) float64 file coordinates, in file order.
-        complete: whether the sample is the whole cloud but for the dropped points.
+        complete: whether the sample is the whole cloud but for the points left out.
 
     """
 
     count: int
     dropped: int
+    no_returns: int
+    no_return_places: Floats
     minimum: Floats
     maximum: Floats
     sample: Floats
@@ -60,7 +65,8 @@ def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progres
     if cloud.count == 0:
         raise InputError(f"{cloud.name} is empty (0 points); give a cloud with points")
     kept = _Subset(cloud.count, budget, seed)
-    count, dropped = 0, 0
+    none = NoReturns(seed)
+    count, dropped, no_returns, late = 0, 0, 0, False
     minimum, maximum = np.full(3, np.inf), np.full(3, -np.inf)
     task: Any = nullcontext(lambda n: None)
     if progress is not None:
@@ -71,18 +77,49 @@ def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progres
             count += len(xyz)
             good = xyz[~noise] if noise.any() else xyz
             dropped += len(xyz) - len(good)
-            if len(good):
-                np.minimum(minimum, good.min(axis=0), out=minimum)
-                np.maximum(maximum, good.max(axis=0), out=maximum)
-                kept.add(good)
+            before = count - len(xyz) > 0
+            late |= none.look(good) and before
+            returned = without(good, none.places)
+            no_returns += len(good) - len(returned)
+            if len(returned):
+                np.minimum(minimum, returned.min(axis=0), out=minimum)
+                np.maximum(maximum, returned.max(axis=0), out=maximum)
+                kept.add(returned)
             advance(len(xyz))
-    _check_usable(cloud, count, dropped, minimum, maximum)
     sample = kept.result()
-    return Scan(count, dropped, minimum, maximum, sample, complete=len(sample) == count - dropped)
+    if late:  # a place that shows late may have points in what was read before
+        sample = without(sample, none.places)
+        minimum, maximum, no_returns = _bounds_again(cloud, none.places, count - dropped)
+    _check_usable(cloud, count, dropped, no_returns, minimum, maximum)
+    return Scan(
+        count,
+        dropped,
+        no_returns,
+        none.places,
+        minimum,
+        maximum,
+        sample,
+        complete=len(sample) == count - dropped - no_returns,
+    )
 
 
-def surface_chunks(cloud: Cloud, size: int = CHUNK_POINTS) -> Iterator[Floats]:
+def _bounds_again(cloud: Cloud, places: Floats, good: int) -> tuple[Floats, Floats, int]:
+    """Return the bounds without the points on some places, and the number of these among the good ones."""
+    minimum, maximum, returned = np.full(3, np.inf), np.full(3, -np.inf), 0
+    for xyz in surface_chunks(cloud, places=places):
+        np.minimum(minimum, xyz.min(axis=0), out=minimum)
+        np.maximum(maximum, xyz.max(axis=0), out=maximum)
+        returned += len(xyz)
+    return minimum, maximum, good - returned
+
+
+def surface_chunks(cloud: Cloud, size: int = CHUNK_POINTS, places: Floats | None = None) -> Iterator[Floats]:
     """Yield the whole cloud as `scan` reads it: (n, 3) float64 file coordinates, noise left out.
+
+    Args:
+        cloud: what to read.
+        size: points of a chunk at most.
+        places: (k, 3) file coordinates whose points are left out too: those of no returns.
 
     Raises:
         InputError: if the file is truncated or damaged.
@@ -90,6 +127,8 @@ def surface_chunks(cloud: Cloud, size: int = CHUNK_POINTS) -> Iterator[Floats]:
     """
     for xyz, noise in cloud.noise_chunks(size):
         good = xyz[~noise] if noise.any() else xyz
+        if places is not None:
+            good = without(good, places)
         if len(good):
             yield good
 
@@ -154,8 +193,10 @@ def _check_finite(cloud: Cloud, xyz: Floats, before: int) -> None:
         )
 
 
-def _check_usable(cloud: Cloud, count: int, dropped: int, minimum: Floats, maximum: Floats) -> None:
-    good = count - dropped
+def _check_usable(
+    cloud: Cloud, count: int, dropped: int, no_returns: int, minimum: Floats, maximum: Floats
+) -> None:
+    good = count - dropped - no_returns
     if good == 0:
         raise InputError(
             f"every point of {cloud.name} is classified as noise or withheld; "

@@ -27,6 +27,11 @@ RARE = {
     "mtpcr.focus why",
     "mtpcr.level <role>.plane_to_verticals_deg",
     "mtpcr.level <role>.verticals_spread_deg",
+    # where several verticals were tried
+    *(
+        f"mtpcr.match verticals[].{key}"
+        for key in ("source", "target", "source_tilt_deg", "target_tilt_deg", "strength", "margin", "taken")
+    ),
 }
 WHOLE = {"T_target_source", "pipeline", "stages[].options"}  # described elsewhere, whatever they hold
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.method.levelling import level, rotation_to_up
+from mtpcr_geo.core.transforms import rotation_to_up
+from mtpcr_geo.method.levelling import level
 
 
 def street(rng: np.random.Generator, slope: float = 0.0) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.core.types import Appearance, Bev, Look, Side
+from mtpcr_geo.core.types import Appearance, Bev, Look, Pair, Side
 from mtpcr_geo.pipeline.options import MatcherName, Models, PriorOptions, Seed
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 from mtpcr_geo.pipeline.stages.pairs import bevs_of
@@ -94,6 +94,11 @@ class MatchOptions(PriorOptions, StageOptions):
         ge=0,
         description="smallest overlap considered, square metres; from the clouds' area if not given",
     )
+    verticals: bool = Field(
+        True,
+        description="where a vertical is not known and the matches under the likeliest one do not convince: "
+        "level, rasterise and match again under others, and keep the strongest",
+    )
     models: Models = None
     turns: int = Field(
         8, ge=1, le=72, description="orientations in which learned matchers are tried, round the circle"
@@ -161,8 +166,28 @@ class Match(Stage):
             self._matcher = self._make(None)
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
-        """Match the source's raster to the target's."""
+        """Match the source's raster to the target's; under several verticals where none is known."""
+        from mtpcr_geo.pipeline.stages.hypotheses import best_vertical
+        from mtpcr_geo.pipeline.stages.rasters import with_rasters
+
         pair = self.one_pair(inputs)
+        bevs_of(self, pair)
+        known = known_place(self.options, pair, self.label)
+        if not self.options.verticals or pair.raster is None or known is not None:
+            return self._matched(pair, context)
+        raster = pair.raster
+        pair, tried = best_vertical(
+            pair,
+            self.options.seed,
+            lambda one: self._matched(one, context),
+            lambda one: self._matched(with_rasters(one, raster, context)[0], context),
+        )
+        if tried:
+            assert pair.matches is not None
+            self.metadata |= {"matches": len(pair.matches), **pair.matches.report, "verticals": tried}
+        return pair
+
+    def _matched(self, pair: Pair, context: RunContext) -> Pair:
         source, target = bevs_of(self, pair)
         known = known_place(self.options, pair, self.label)
         prior = None if known is None else prior_of(known, pair)

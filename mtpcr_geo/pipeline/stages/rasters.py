@@ -13,8 +13,9 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.core.types import Bev, Pair, Side
+from mtpcr_geo.core.types import Bev, Pair, RasterSettings, Side
 from mtpcr_geo.method.bev import (
+    Cells,
     Convention,
     Coverage,
     ceil_grid,
@@ -105,10 +106,24 @@ class Level(Stage):
             self.metadata[role] = {
                 "points": scanned.count,
                 "noise_points": scanned.dropped,
+                "no_return_points": scanned.no_returns,
                 "sampled": len(scanned.sample),
                 **levelling.audit(),
             }
-            sides.append(Side(role, cloud, link, sample, scanned.complete, levelling))
+            bounds = np.stack([scanned.minimum, scanned.maximum])
+            sides.append(
+                Side(
+                    role,
+                    cloud,
+                    link,
+                    sample,
+                    scanned.complete,
+                    levelling,
+                    bounds=bounds,
+                    no_returns=scanned.no_returns,
+                    no_return_places=scanned.no_return_places,
+                )
+            )
         return Pair(sides[0], sides[-1], frame)
 
 
@@ -159,37 +174,54 @@ class MakeBev(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Choose the cell and rasterise both sides."""
-        pair = self.one_pair(inputs)
-        sides = [pair.target] if pair.source is pair.target else [pair.target, pair.source]
-        coverages = [_coverage(side) for side in sides]
         options = self.options
-        cells = choose_cells(
-            coverages,
-            cell=options.cell,
-            finest=options.finest,
-            resolution=options.resolution,
-            gamma=options.gamma,
+        settings = RasterSettings(
+            options.cell, options.finest, options.resolution, options.gamma, options.pixel
         )
+        pair, cells, coverages = with_rasters(self.one_pair(inputs), settings, context)
         self.metadata |= {"cell_m": cells.cells_m[-1], "cell_chosen": options.cell is None}
         if cells.gamma_m is not None:
             self.metadata["gamma_m"] = cells.gamma_m
-        done = []
-        for side, coverage, cell in zip(sides, coverages, cells.cells_m, strict=True):
-            bev = rasterised(side, cell, options.pixel, context)
-            done.append(replace(side, bev=bev))
+        for side, coverage in zip((pair.target, pair.source), (coverages[0], coverages[-1]), strict=True):
+            assert side.bev is not None
             self.metadata[side.role] = {
-                "cell_m": cell,
-                "width": bev.grid.width,
-                "height": bev.grid.height,
-                "filled_share": float((bev.count > 0).mean()),
+                "cell_m": side.bev.grid.cell,
+                "width": side.bev.grid.width,
+                "height": side.bev.grid.height,
+                "filled_share": float((side.bev.count > 0).mean()),
                 "points_per_m2": coverage.per_m2,
                 "area_m2": coverage.occupied_m2,
             }
-        return pair.with_(target=done[0], source=done[-1])
+        return pair
+
+
+def with_rasters(
+    pair: Pair, settings: RasterSettings, context: RunContext
+) -> tuple[Pair, Cells, list[Coverage]]:
+    """Choose the cells and rasterise both sides; return how they were chosen, target first.
+
+    Raises:
+        RegistrationError: if a raster would not fit into memory.
+
+    """
+    sides = [pair.target] if pair.source is pair.target else [pair.target, pair.source]
+    coverages = [_coverage(side) for side in sides]
+    cells = choose_cells(
+        coverages,
+        cell=settings.cell,
+        finest=settings.finest,
+        resolution=settings.resolution,
+        gamma=settings.gamma,
+    )
+    done = [
+        replace(side, bev=rasterised(side, cell, settings.pixel, context))
+        for side, cell in zip(sides, cells.cells_m, strict=True)
+    ]
+    return pair.with_(target=done[0], source=done[-1], raster=settings), cells, coverages
 
 
 def _coverage(side: Side) -> Coverage:
-    return coverage_of(side.sample, side.levelled_sample, side.cloud.count)
+    return coverage_of(side.levelled_sample, points=side.cloud.count - side.no_returns)
 
 
 def rasterised(side: Side, cell: float, convention: Convention, context: RunContext) -> Bev:
@@ -205,14 +237,14 @@ def _levelled_chunks(side: Side, context: RunContext) -> Iterator[Floats]:
     from mtpcr_geo.io.sample import surface_chunks
 
     with context.progress.task(f"rasterising {side.cloud.name}", side.cloud.count) as advance:
-        for xyz in surface_chunks(side.cloud):
+        for xyz in surface_chunks(side.cloud, places=side.no_return_places):
             yield transforms.apply(side.T_level_work, in_work_frame(side.link, xyz))
             advance(len(xyz))
 
 
 def _levelled_bounds(side: Side) -> tuple[Floats, Floats]:
     """Bounds of the whole cloud once levelled, from the corners of its box: a little generous."""
-    low, high = side.cloud.minimum, side.cloud.maximum
+    low, high = (side.cloud.minimum, side.cloud.maximum) if side.bounds is None else side.bounds
     corners = np.array(
         [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
     )

@@ -115,7 +115,8 @@ def _match_options(options: MethodOptions, matcher: str) -> MatchOptions:
     models = None if matcher == "correlation" else options.models
     # what is not given stays so, as in pipelines written by hand
     known = {name: getattr(options, name) for name in PriorOptions.model_fields}
-    return MatchOptions(method=matcher, models=models, seed=options.seed, **known)
+    tried = options.level == "auto"
+    return MatchOptions(method=matcher, models=models, verticals=tried, seed=options.seed, **known)
 
 
 def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:

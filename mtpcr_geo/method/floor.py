@@ -1,0 +1,153 @@
+"""The floor of a cloud: the sheet of lowest points that lies under everything else, seen along any direction.
+
+Ground is found by what it is for: something lies on it and nothing beneath it. Seen along the vertical, the
+lowest points of coarse cells lie near one plane, over much of the cloud's area; seen along any other
+direction they are scattered, few, or both. So a floor tells up from down, and upright clouds from those with
+y up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.transforms import angle_deg, rotation_to_up
+from mtpcr_geo.method.downsample import one_per_voxel
+
+CELLS_ACROSS = 30
+"""Cells along the edge of a square of the cloud's extent in which lowest points are taken."""
+NEAR_PER_EXTENT = 1 / 60
+"""Distance from the plane within which a cell's lowest point counts as on it, over the extent."""
+FEWEST_CELLS = 12
+ROUNDS = 8
+FIT_ROUNDS = 10
+VOXELS_ACROSS, POINTS = 150.0, 20_000
+APART_DEG = 10.0
+"""Floors that are no farther apart are one."""
+STILL_DEG = 0.02
+LEAST_UNEVEN = 1e-3
+"""Spread over extent below which floors count as equally even."""
+
+
+@dataclass(frozen=True)
+class Floor:
+    """The sheet of lowest points along a direction.
+
+    Attributes:
+        up: (3,) unit normal, pointing to where the other points are.
+        cells: cells whose lowest point is near it: its area, in cells of 1/30 of the extent.
+        share: of the cells seen.
+        spread_m: robust spread of the lowest points about it, metres.
+        extent_m: of the cloud, metres.
+        above: of the points well off the plane, the share above it; 1/2 where there are none. On a plain it
+            alone tells up from down.
+
+    """
+
+    up: Floats
+    cells: int
+    share: float
+    spread_m: float
+    extent_m: float
+    above: float
+
+    @property
+    def quality(self) -> float:
+        """Area over unevenness, times the share above it: what floors are ranked by."""
+        return self.cells * self.above / (self.spread_m / self.extent_m + LEAST_UNEVEN)
+
+
+def extent_of(xyz: Floats) -> float:
+    """Return the middle one of a cloud's three extents, metres, whichever way it is turned; strays left out.
+
+    It is the width of what is seen from above, where a cloud is wider than it is high.
+    """
+    xyz = xyz[:: max(1, len(xyz) // POINTS)]
+    _, axes = np.linalg.eigh(np.cov((xyz - np.median(xyz, axis=0)).T))
+    low, high = np.percentile(xyz @ axes, [2.0, 98.0], axis=0)
+    return float(max(np.sort(high - low)[1], 1e-3))
+
+
+def floor_along(xyz: Floats, about: Floats, extent: float) -> Floor:
+    """Find the floor seen along a direction, and follow its plane until it stands still.
+
+    Args:
+        xyz: (n, 3) thinned points, metres.
+        about: (3,) unit vector, roughly up.
+        extent: of the cloud, metres, see `extent_of`.
+
+    """
+    xyz = xyz - xyz.mean(axis=0)
+    cell, near = extent / CELLS_ACROSS, extent * NEAR_PER_EXTENT
+    up = about
+    found = Floor(about, 0, 0.0, float("inf"), extent, 0.5)
+    for _ in range(ROUNDS):
+        R = rotation_to_up(up)
+        lowest = _lowest(xyz @ R.T, cell)
+        if len(lowest) < FEWEST_CELLS:
+            return found
+        slope, level, rest = _plane(lowest, extent)
+        on = np.abs(rest) < near
+        spread = 1.4826 * float(np.median(np.abs(rest)))
+        normal = np.array([-slope[0], -slope[1], 1.0])
+        new = R.T @ (normal / np.linalg.norm(normal))
+        well_off = max(4.0 * spread, LEAST_UNEVEN * extent)
+        height = (xyz @ R.T) @ normal - level
+        above, below = (height > well_off).sum(), (height < -well_off).sum()
+        share = float((above + 1) / (above + below + 2))
+        found = Floor(new, int(on.sum()), float(on.mean()), spread, extent, share)
+        moved, up = angle_deg(up, new), new
+        if moved < STILL_DEG:
+            break
+    return found
+
+
+def _lowest(xyz: Floats, cell: float) -> Floats:
+    """Return the lowest point of each cell, (m, 3), the outermost hundredth of the points left out."""
+    low, high = np.percentile(xyz[:, :2], [0.5, 99.5], axis=0)
+    inside = ((xyz[:, :2] >= low) & (xyz[:, :2] <= high)).all(axis=1)
+    xyz = xyz[inside]
+    column, row = np.floor((xyz[:, :2] - low) / cell).astype(np.int64).T
+    key = column * (int(row.max(initial=0)) + 1) + row
+    order = np.lexsort((xyz[:, 2], key))
+    first = np.concatenate([[True], np.diff(key[order]) > 0])
+    return np.asarray(xyz[order[first]])
+
+
+def _plane(lowest: Floats, extent: float) -> tuple[Floats, float, Floats]:
+    """Fit a plane to lowest points: its slope (2,), its height at the origin, and (m,) heights above it.
+
+    What lies above it counts less than what lies below: cells that see no ground show canopy or a roof.
+    """
+    A = np.column_stack([np.ones(len(lowest)), lowest[:, :2]])
+    weight = np.ones(len(lowest))
+    x: Floats = np.zeros(3)
+    rest: Floats = np.zeros(len(lowest))
+    for _ in range(FIT_ROUNDS):
+        fit = np.linalg.lstsq(A * weight[:, None], lowest[:, 2] * weight, rcond=None)[0]
+        x = np.asarray(fit, np.float64)
+        rest = np.asarray(lowest[:, 2] - A @ x, np.float64)
+        scale = max(1.4826 * float(np.median(np.abs(rest))), 1e-4 * extent)
+        weight = 1.0 / (1.0 + (np.where(rest > 0, rest, rest / 2.0) / scale) ** 2)
+    return x[1:], float(x[0]), rest
+
+
+def floors_of(xyz: Floats, extent: float, rng: np.random.Generator) -> tuple[Floor, ...]:
+    """Find the distinct floors of a cloud, from both ends of each axis, best first.
+
+    Args:
+        xyz: (n, 3) points, metres.
+        extent: of the cloud, metres, see `extent_of`.
+        rng: thins the points.
+
+    """
+    few = one_per_voxel(xyz, extent / VOXELS_ACROSS, rng, POINTS)
+    axes = np.concatenate([np.eye(3), -np.eye(3)])[[2, 5, 0, 1, 3, 4]]
+    found = sorted((floor_along(few, axis, extent) for axis in axes), key=lambda floor: -floor.quality)
+    distinct: list[Floor] = []
+    for floor in found:
+        if all(angle_deg(floor.up, other.up) > APART_DEG for other in distinct):
+            distinct.append(floor)
+    return tuple(distinct)
