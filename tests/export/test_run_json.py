@@ -27,6 +27,9 @@ RARE = {
     "mtpcr.focus why",
     "mtpcr.level <role>.plane_to_verticals_deg",
     "mtpcr.level <role>.verticals_spread_deg",
+    # where a vertical that levelling found was corrected
+    "mtpcr.refine levelled_again",
+    "mtpcr.refine tilt_deg",
     # where several verticals were tried
     *(
         f"mtpcr.match verticals[].{key}"
