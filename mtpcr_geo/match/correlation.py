@@ -18,16 +18,16 @@ from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Matches
 from mtpcr_geo.match.base import margin_of
-from mtpcr_geo.match.candidates import Candidate, Pool
+from mtpcr_geo.match.candidates import Candidate, Pool, same_pose
 from mtpcr_geo.match.descent import follow
 from mtpcr_geo.match.judge import CLEAR_MARGIN, Judge
-from mtpcr_geo.match.pose import Pose, centre_of
+from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.pyramid import Level, Pyramid, search_factors
 from mtpcr_geo.match.reasons import nothing_to_compare
 from mtpcr_geo.match.search import GlobalSearch, Layer, distinct
 from mtpcr_geo.match.terrain import FEWEST_CELLS as FEWEST_GROUND_CELLS
-from mtpcr_geo.match.terrain import Terrain, TerrainSearch, place_on
+from mtpcr_geo.match.terrain import Terrain, TerrainSearch, closest, place_on
 from mtpcr_geo.method.scales import Scales, scales_of
 
 COARSEST_YAW_STEP_DEG, FINEST_YAW_STEP_DEG = 4.0, 2.0
@@ -36,12 +36,17 @@ PEAKS_A_YAW = 3
 HYPOTHESES, MORE_HYPOTHESES = 10, 48
 """Hypotheses of a level followed at first, and at most where these do not convince: a small source has more
 places to lie in a large target, and each costs less to follow."""
-TERRAIN_HYPOTHESES, MORE_TERRAIN_HYPOTHESES = 6, 24
+TERRAIN_HYPOTHESES, MORE_TERRAIN_HYPOTHESES = 6, 16
+SETTLED_BY_TERRAIN = 40
+"""Poses that the terrains propose, of which those are followed under which they are closest."""
 MIRRORED_HYPOTHESES = 24
 """Hypotheses of a level of the mirrored search followed at first: where a scene repeats itself many score
 alike, and the best of them must be met."""
 SMALL_SITE_NEG_LOG10_P, SMALL_SITE_MARGIN, SMALL_SITE_SUPPORT = 8.0, 3.0, 0.5
 """What convinces where there are too few patches for `CorrelationSettings.convincing_neg_log10_p`."""
+CONVINCING_SPREAD_M = 0.5
+"""Spread of the grounds' height differences above which a pose does not convince by itself: roofs and crops
+spread them so, and so does another row of the same houses."""
 PROMISING_NEG_LOG10_P, CONVINCING_NULL_RATIO = 4.0, 2.0
 """Significance from which the mirrored source is asked before finer levels are searched, and the strength
 over it that ends the search: wrong poses have reached 1.5."""
@@ -238,7 +243,7 @@ class _Search:
         self.done: list[tuple[int, int]] = []
         self.judged: list[Candidate] = []
         self.pool = Pool()
-        self._proposed: dict[int, tuple[list[Pose], list[Pose]]] = {}
+        self._proposed: dict[int, list[Pose]] = {}
 
     def explore(self, factor: int, part: int, known: float = 0.0) -> bool:
         """Propose at a level, and follow and judge the first or the second part of what was proposed.
@@ -252,26 +257,35 @@ class _Search:
             Whether there were any.
 
         """
+        first = not self.done
         if factor not in self._proposed:
-            self._proposed[factor] = self._propose(factor), self._propose_by_terrain(factor)
+            self._proposed[factor] = self._propose(factor)
             cell = self.pyramid.source.grid.cell * factor
-            scores = tuple(round(pose.score, 3) for pose in self._proposed[factor][0])
+            scores = tuple(round(pose.score, 3) for pose in self._proposed[factor])
             self.levels.append(Level(factor, cell, scores))
+        by_terrain: list[Pose] = []
+        if first:
+            by_terrain = self._propose_by_terrain(self.scales.terrain_cell_m, TERRAIN_HYPOTHESES)
+            pose = None if self.prior is None else self.prior.pose(self.pyramid.at(1)[0].grid)
+            by_terrain += [] if pose is None else [pose]
+        elif part and len(self.levels) == 1:
+            by_terrain = self._propose_by_terrain(self.scales.terrain_cell_m / 2, MORE_TERRAIN_HYPOTHESES)
         self.done.append((factor, part))
-        by_channels, by_terrain = self._proposed[factor]
-        cuts = self.first, TERRAIN_HYPOTHESES
-        if part:
-            by_channels, by_terrain = by_channels[cuts[0] :], by_terrain[cuts[1] :]
-        else:
-            by_channels, by_terrain = by_channels[: cuts[0]], by_terrain[: cuts[1]]
-            if self.prior is not None and len(self.levels) == 1:
-                pose = self.prior.pose(self.pyramid.at(factor)[0].grid)
-                by_terrain = by_terrain if pose is None else [*by_terrain, pose]
+        proposed = self._proposed[factor]
+        by_channels = proposed[self.first :] if part else proposed[: self.first]
         if not by_channels and not by_terrain:
             return False
-        followed = [
-            follow(self.pyramid, factor, by_channels, known / CLEAR_MARGIN),
-            follow(self.pyramid, factor, by_terrain),
+        followed = [follow(self.pyramid, factor, by_channels, known / CLEAR_MARGIN)]
+        near, radius = self.scales.same_pose_m / 2, self.scales.extent_m / 2
+        others = [
+            pose
+            for pose in by_terrain
+            if not any(same_pose(pose, other, near, radius) for other in followed[0].poses)
+        ]
+        # the lowest of a cell shifts with the grid it lies on: by terrain a pose may be some metres off
+        followed += [
+            follow(self.pyramid, 1, others),
+            follow(self.pyramid, factor, self._on_level(factor, others)),
         ]
         known = max([known, *(candidate.strength for candidate in self.judged)])
         now, left = self.judge.judge([pose for descent in followed for pose in descent.poses], known)
@@ -296,6 +310,8 @@ class _Search:
         if not self.pool.candidates or self.pool.margin < self.settings.convincing_margin:
             return False
         best = self.pool.candidates[0]
+        if best.ground is not None and best.ground.known and best.ground.spread_m > CONVINCING_SPREAD_M:
+            return False
         if best.neg_log10_p >= self.settings.convincing_neg_log10_p:
             return True
         return (
@@ -348,27 +364,40 @@ class _Search:
         poses = search.run(yaws, PEAKS_A_YAW, 4, self.advance)
         return distinct(poses, self.most, 2 * step, 5 * cell)
 
-    def _propose_by_terrain(self, factor: int) -> list[Pose]:
-        """Propose, for the first level, the poses under which the grounds have the same shape."""
-        source, target = self.terrain
+    def _propose_by_terrain(self, cell_m: float, count: int) -> list[Pose]:
+        """Propose poses, about the finest centre, under which the grounds have the same shape.
+
+        Args:
+            cell_m: cell in which they are compared, metres.
+            count: how many to propose at most.
+
+        """
+        source, target = (
+            Terrain.of(bev, max(cell_m, self.scales.cell_m))
+            for bev in (self.pyramid.source, self.pyramid.target)
+        )
         cell, prior = source.grid.cell, self.prior
         reached = target if prior is None else prior.terrain(source.grid, target)
-        if self._proposed or reached is None:
+        if reached is None or min(source.mask.sum(), reached.mask.sum()) < 4 * FEWEST_GROUND_CELLS:
             return []
-        if min(source.mask.sum(), reached.mask.sum()) < 4 * FEWEST_GROUND_CELLS:
-            return []
-        step = np.radians(COARSEST_YAW_STEP_DEG)
-        yaws = np.arange(0.0, 2 * np.pi - step / 2, step)
+        first = not self.done
+        step = float(np.radians(COARSEST_YAW_STEP_DEG if first else FINEST_YAW_STEP_DEG))
+        yaws = np.arange(round(2 * np.pi / step)) * step
         search = TerrainSearch(source, reached, max(self._least_m2 / cell**2, FEWEST_GROUND_CELLS))
         if prior is not None:
             yaws = prior.yaws(step)
             place = prior.place_of(source.grid)
             if place is not None:
                 search.restrict(place, prior.radius_m)
-        more = TERRAIN_HYPOTHESES if self.most == self.first else MORE_TERRAIN_HYPOTHESES
-        found = distinct(search.run(yaws), more, 2 * step, 3 * cell)
-        grid = self.pyramid.at(factor)[0].grid
+        found = distinct(search.run(yaws), SETTLED_BY_TERRAIN, 2 * step, 3 * cell)
+        found = closest(source, target, found, count, plane=not self.settings.trust_vertical)
+        grid = self.pyramid.at(1)[0].grid
         return [place_on(pose, source, grid) for pose in found]
+
+    def _on_level(self, factor: int, poses: list[Pose]) -> list[Pose]:
+        """Express poses about the finest centre as poses about that of a level."""
+        finest, grid = self.pyramid.source.grid, self.pyramid.at(factor)[0].grid
+        return [pose_of(pose.hypothesis(centre_of(finest)), centre_of(grid)) for pose in poses]
 
     @property
     def _least_m2(self) -> float:

@@ -7,7 +7,8 @@ plane where a vertical is not trusted: as a search of its own that proposes pose
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -15,13 +16,16 @@ import numpy as np
 
 from mtpcr_geo.core.arrays import Floats, Image
 from mtpcr_geo.core.grid import Grid
+from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import Bev, Hypothesis
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of, warp_to
+from mtpcr_geo.match.search import distinct
 from mtpcr_geo.method.bev import coarsen
 
 NOISE_M = 0.1
 """Spread of the ground's height differences below which cells, borders and noise leave nothing to compare."""
 FEWEST_CELLS = 8
+SETTLING_STEPS, STILL_CELLS = 15, 0.002
 KNOWN = 0.99
 """Weight of filled cells above which an interpolated height is one of the ground alone."""
 
@@ -118,6 +122,8 @@ class TerrainSearch:
 
     The score of a pose is half the logarithm of the likelihood ratio of Gaussian heights: with n cells in
     common, ``n / 2 * log((var s + var t) / var(t - s))``, each variance about its own mean over those cells.
+    Neighbouring heights go together, so that this evidence grows too fast with the overlap; closeness, with
+    the root of n in its place, finds small overlaps in which the grounds agree.
 
     Args:
         source, target: both terrains, of one cell size.
@@ -149,8 +155,8 @@ class TerrainSearch:
         padded[: image.shape[0], : image.shape[1]] = image
         return np.asarray(cv2.dft(padded, nonzeroRows=image.shape[0]), np.float32)
 
-    def best(self, yaw: float) -> Pose | None:
-        """Return the best shift under one yaw, if any overlap is large enough."""
+    def best(self, yaw: float) -> list[tuple[Pose, float]]:
+        """Return the best shifts under one yaw, by evidence and by closeness, each with its closeness."""
         grid = self.target.grid
         half = self._side * grid.cell / 2
         square = Grid(-half, half, grid.cell, self._side, self._side)
@@ -171,25 +177,120 @@ class TerrainSearch:
         var_t = np.maximum(taa / cells - mean_t**2, 0.0) + NOISE_M**2
         both = cross / cells - mean_s * mean_t
         rest = np.maximum(var_s + var_t - 2 * both, 2 * NOISE_M**2)
-        score = np.where(n >= self.min_cells, cells / 2 * np.log((var_s + var_t) / rest), -np.inf)
+        ratio = np.log((var_s + var_t) / rest)
         dy, dx = np.arange(self._shape[0])[:, None], np.arange(self._shape[1])[None, :]
         dy = np.where(dy < grid.height, dy, dy - self._shape[0])
         dx = np.where(dx < grid.width, dx, dx - self._shape[1])
         x = grid.west + (dx + self._side / 2) * grid.cell
         y = grid.north - (dy + self._side / 2) * grid.cell
+        considered = n >= self.min_cells
         if self._near is not None:
             (near_x, near_y), reach = self._near[0](yaw), self._near[1]
-            score = np.where((x - near_x) ** 2 + (y - near_y) ** 2 <= reach**2, score, -np.inf)
-        row, column = np.unravel_index(int(np.argmax(score)), score.shape)
-        if not np.isfinite(score[row, column]):
-            return None
-        east, north = x[0, column], y[row, 0]
-        return Pose(yaw, float(east), float(north), float(score[row, column]), round(float(n[row, column])))
+            considered &= (x - near_x) ** 2 + (y - near_y) ** 2 <= reach**2
+        if not considered.any():
+            return []
+        evidence, closeness = cells / 2 * ratio, np.sqrt(cells) * ratio
+        found = []
+        for measure in (evidence, closeness):
+            place = int(np.argmax(np.where(considered, measure, -np.inf)))
+            row, column = np.unravel_index(place, n.shape)
+            east, north = float(x[0, column]), float(y[row, 0])
+            pose = Pose(yaw, east, north, float(evidence[row, column]), round(float(n[row, column])))
+            found.append((pose, float(closeness[row, column])))
+        return found
 
     def run(self, yaws: Iterable[float]) -> list[Pose]:
-        """Search all yaws; the best of each, best first."""
-        found = [pose for pose in map(self.best, yaws) if pose is not None]
-        return sorted(found, key=lambda pose: -pose.score)
+        """Search all yaws: the best of each by evidence and by closeness, best first of both in turn."""
+        with ThreadPoolExecutor(usable_cores()) as threads:
+            found = [one for some in threads.map(self.best, yaws) for one in some]
+        by_evidence = sorted(found, key=lambda one: -one[0].score)
+        by_closeness = sorted(found, key=lambda one: -one[1])
+        return [pose for both in zip(by_evidence, by_closeness, strict=True) for pose, _ in both]
+
+
+def settle(source: Terrain, target: Terrain, pose: Pose, *, plane: bool = False) -> Pose:
+    """Move a pose to where both grounds agree best near by (Gauss and Newton, outliers weighed down).
+
+    Args:
+        source, target: both terrains.
+        pose: about the centre of the source's raster.
+        plane: whether a plane of height differences is free too, for clouds whose vertical is not trusted;
+            else their mean alone.
+
+    """
+    grid = target.grid
+    rows, columns = np.nonzero(source.mask)
+    if len(rows) < FEWEST_CELLS:
+        return pose
+    offset = source.grid.to_metres(np.column_stack([columns, rows]).astype(np.float64)) - centre_of(
+        source.grid
+    )
+    height = source.low[rows, columns].astype(np.float64)
+    inner = cv2.erode(target.mask, np.ones((3, 3), np.uint8))
+    north, east = np.gradient(target.low, grid.cell)
+    yaw, x, y = pose.yaw, pose.east, pose.north
+    for _ in range(SETTLING_STEPS):
+        c, s = np.cos(yaw), np.sin(yaw)
+        turned = offset @ np.array([[c, s], [-s, c]])
+        px = grid.to_pixel(turned + [x, y]).astype(np.float32)
+        at = px[:, :1], px[:, 1:]
+        known = cv2.remap(inner, *at, cv2.INTER_LINEAR)[:, 0] > KNOWN
+        if known.sum() < 3 * FEWEST_CELLS:
+            return pose
+        low, to_east, to_north = (
+            cv2.remap(image.astype(np.float32), *at, cv2.INTER_LINEAR)[known, 0].astype(np.float64)
+            for image in (target.low, east, -north)
+        )
+        here = turned[known]
+        level = [np.ones(len(here)), *here.T] if plane else [np.ones(len(here))]
+        J = np.column_stack([to_east, to_north, to_north * here[:, 0] - to_east * here[:, 1], *level])
+        rest = height[known] - low
+        rest -= np.median(rest)
+        scale = max(1.4826 * float(np.median(np.abs(rest))), NOISE_M / 2)
+        weight = 1.0 / (1.0 + (rest / (2.0 * scale)) ** 2)
+        # flat ground tells nothing: a step of a cell, or of what turns the rim by one, costs as much as noise
+        rim = float(np.hypot(*here.T).max())
+        held = np.zeros(J.shape[1])
+        held[:3] = np.array([1.0, 1.0, rim]) * NOISE_M / grid.cell
+        step = np.linalg.solve(
+            (J * weight[:, None] ** 2).T @ J + np.diag(held**2 + 1e-12), (J * weight[:, None] ** 2).T @ rest
+        )
+        longest = max(float(np.hypot(step[0], step[1])), abs(step[2]) * rim)
+        step *= min(1.0, 2.0 * grid.cell / max(longest, 1e-12))
+        x, y, yaw = x + step[0], y + step[1], yaw + step[2]
+        if longest < STILL_CELLS * grid.cell:
+            break
+    moved = Pose(float(yaw), float(x), float(y), pose.score, pose.overlap_cells)
+    before, after = (
+        compare_ground(source, target, one.hypothesis(centre_of(source.grid)), plane=plane)
+        for one in (pose, moved)
+    )
+    return moved if after.known and after.spread_m <= before.spread_m else pose
+
+
+def closest(
+    source: Terrain, target: Terrain, poses: Sequence[Pose], count: int, *, plane: bool = False
+) -> list[Pose]:
+    """Settle poses, and keep those under which the grounds are closest for the cells they share.
+
+    Args:
+        source, target: both terrains.
+        poses: candidates, best first; the first is kept whatever it comes to.
+        count: how many to keep at most.
+        plane: see `settle`.
+
+    """
+    relief = float(np.std(source.low[source.mask > 0])) if source.mask.any() else 0.0
+    ranked: list[tuple[float, Pose]] = []
+    for number, pose in enumerate(poses):
+        moved = settle(source, target, pose, plane=plane)
+        found = compare_ground(source, target, moved.hypothesis(centre_of(source.grid)), plane=plane)
+        if found.known:
+            ratio = np.log((relief + NOISE_M / 2) / (found.spread_m + NOISE_M / 2))
+            ranked.append((np.inf if number == 0 else float(np.sqrt(found.cells) * ratio), moved))
+    ranked.sort(key=lambda one: -one[0])
+    apart = source.grid.cell / 2
+    return distinct((pose for _, pose in ranked), count, np.radians(1.0), apart)
 
 
 def place_on(pose: Pose, terrain: Terrain, grid: Grid) -> Pose:
