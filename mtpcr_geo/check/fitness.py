@@ -119,14 +119,16 @@ def vertical_findings(side: Fitness) -> Iterator[Finding]:
             f"name its CRS (--{side.role}-crs) if it has one; --level none if it is upright",
         )
     elif LEANS_DEG <= found.tilt_deg < TILTED_DEG:
-        by = {"plane": "its ground plane", "verticals": "its walls, poles and trunks"}.get(
-            found.method, "itself"
-        )
+        by = {
+            "plane": "its ground plane",
+            "floor": "the sheet of its lowest points",
+            "verticals": "its walls, poles and trunks",
+        }.get(found.method, "itself")
         yield Finding(
             "note",
             "leans",
             side.role,
-            f"by {by} it leans by {found.tilt_deg:.1f} degrees: a registration turns it upright first",
+            f"by {by} it leans by {found.tilt_deg:.1f} degrees: a registration takes that for level at first",
             "give --level none if it is upright as it stands",
         )
 

@@ -16,8 +16,8 @@ search radius       1/4 of a patch, at least 3 cells         at most 6 m
 block               1/5 of the tie points' extent,           at most 40 m
                     at least a cell
 least overlap       1/5 of the smaller area                  at most 400 m2
-terrain cell        1/8 of the extent, at least 4 cells      1 to 8 m, or 1/40
-                                                             of the extent
+terrain cell        1/8 of the extent, at least 4 cells      1 to 8 m, or 1/40 of
+                                                             the extent, to 32 m
 same pose           half a patch                             1 to 12 m
 ground cell         twice the raster's cell                  0.5 to 2 m
 tolerance           a cell                                   at least 0.5 m
@@ -42,7 +42,7 @@ MAX_SEARCH_RADIUS_M, MIN_SEARCH_RADIUS_CELLS = 6.0, 3
 MAX_BLOCK_M, BLOCKS_PER_EXTENT = 40.0, 5.0
 MAX_LEAST_OVERLAP_M2, LEAST_OVERLAP_SHARE = 400.0, 0.2
 MIN_TERRAIN_CELL_M, MAX_TERRAIN_CELL_M = 1.0, 8.0
-TERRAIN_CELLS_ACROSS = 40.0
+TERRAIN_CELLS_ACROSS, MAX_WIDE_TERRAIN_CELL_M = 40.0, 32.0
 MIN_SAME_POSE_M, MAX_SAME_POSE_M = 1.0, 12.0
 MIN_GROUND_CELL_M, MAX_GROUND_CELL_M = 0.5, 2.0
 MIN_TOLERANCE_M = 0.5
@@ -128,7 +128,11 @@ def scales_for(cell: float, area_m2: float, fill: float = 1.0) -> Scales:
             np.clip(
                 max(extent / 8.0, 4.0 * cell),
                 MIN_TERRAIN_CELL_M,
-                max(MAX_TERRAIN_CELL_M, 4.0 * cell, extent / TERRAIN_CELLS_ACROSS),
+                max(
+                    MAX_TERRAIN_CELL_M,
+                    4.0 * cell,
+                    min(extent / TERRAIN_CELLS_ACROSS, MAX_WIDE_TERRAIN_CELL_M),
+                ),
             )
         ),
         fill=fill,

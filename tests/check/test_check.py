@@ -620,7 +620,7 @@ def test_a_local_target_gives_a_result_without_a_crs(tmp_path):
 @pytest.mark.parametrize(
     ("name", "words", "roles"),
     [
-        ("forest_plot_mls_uas", {"source_crs": "local"}, {"vertical-unknown"}),
+        ("forest_plot_mls_uas", {"source_crs": "local"}, {"leans", "vertical-unknown"}),
         ("forest_plot_mls_uas", {"source_crs": "EPSG:6341+5703"}, set()),
         ("robot_scans", {"local": True}, {"leans"}),
         ("suburb_dense_ign770", {}, set()),

@@ -11,7 +11,15 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.types import Bev, Hypothesis
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.search import angle_between
-from mtpcr_geo.match.terrain import FEWEST_CELLS, Terrain, TerrainSearch, compare_ground, place_on
+from mtpcr_geo.match.terrain import (
+    FEWEST_CELLS,
+    Terrain,
+    TerrainSearch,
+    closest,
+    compare_ground,
+    place_on,
+    settle,
+)
 from mtpcr_geo.method.bev import grid_around, rasterise
 
 CELL = 4.0
@@ -197,3 +205,49 @@ def test_a_search_without_overlap_enough_finds_nothing(source: np.ndarray, targe
     assert TerrainSearch(s, t, s.mask.sum() + 1).run([0.0, 1.0]) == []
     empty = replace(s, mask=np.zeros_like(s.mask), low=np.zeros_like(s.low))
     assert TerrainSearch(empty, t, 1).run([0.0, 1.0]) == []
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "east", "north"), [(0.0, 0.0, 0.0), (2.0, 5.0, -3.0), (-3.0, -6.0, 4.0)]
+)
+def test_a_pose_settles_where_the_grounds_agree(source, target, turn_deg, east, north) -> None:
+    s, t = terrain_of(source), terrain_of(target)
+    true = pose_of(TRUE, centre_of(s.grid))
+    start = Pose(true.yaw + np.radians(turn_deg), true.east + east, true.north + north)
+    found = settle(s, t, start)
+    # the lowest of a cell of 4 m lies anywhere in it
+    assert np.hypot(found.east - true.east, found.north - true.north) < 1.0
+    assert np.degrees(angle_between(found.yaw, true.yaw)) < 0.5
+    centre = centre_of(s.grid)
+    before, after = (compare_ground(s, t, pose.hypothesis(centre)).spread_m for pose in (start, found))
+    assert after <= before
+
+
+def test_a_tilted_ground_settles_where_a_plane_is_free(source, target) -> None:
+    s, t = terrain_of(source), terrain_of(target)
+    x = s.grid.to_metres(np.column_stack([np.arange(s.grid.width), np.zeros(s.grid.width)]))[:, 0]
+    leaning = replace(s, low=(s.low + np.float32(0.05) * x[None, :].astype(np.float32)) * s.mask)
+    true = pose_of(TRUE, centre_of(s.grid))
+    start = Pose(true.yaw + 0.02, true.east + 4.0, true.north - 3.0)
+    found = settle(leaning, t, start, plane=True)
+    assert np.hypot(found.east - true.east, found.north - true.north) < 1.5
+
+
+def test_poses_far_from_any_ground_stay_where_they_are(source, target) -> None:
+    s, t = terrain_of(source), terrain_of(target)
+    away = Pose(0.3, 5000.0, 5000.0)
+    assert settle(s, t, away) == away
+    assert closest(s, t, [away], 3) == []
+
+
+def test_the_closest_grounds_come_first_though_others_share_more(target) -> None:
+    # a corner of 60 m is all that both share
+    s = terrain_of(transforms.apply(T_MOVED, ground(2, (40.0, 40.0), (180.0, 180.0))))
+    t = terrain_of(target)
+    true = pose_of(TRUE, centre_of(s.grid))
+    others = [Pose(true.yaw + k, true.east - 60.0, true.north - 60.0) for k in (0.0, 1.5, 3.0)]
+    near = Pose(true.yaw + 0.01, true.east + 3.0, true.north - 2.0)
+    first, second, *_ = closest(s, t, [*others, near], 4)
+    # the first given is kept first whatever it comes to
+    assert np.hypot(first.east - true.east, first.north - true.north) > 20.0
+    assert np.hypot(second.east - true.east, second.north - true.north) < 2.0

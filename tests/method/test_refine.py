@@ -61,6 +61,27 @@ def test_icp_does_not_hang_on_its_start_or_on_round_off(clouds) -> None:
     assert np.linalg.norm(again - plain, axis=1).max() < 0.001
 
 
+def test_exchanged_clouds_are_refined_to_the_inverse(clouds) -> None:
+    source, target = clouds[0][:40_000], clouds[1]
+    start = off_by(0.4, (0.4, -0.3, 0.2))
+    there = refine(source, target, start)
+    back = refine(target, source, transforms.inverse(start))
+    assert np.allclose(there.T @ back.T, np.eye(4), atol=1e-9)
+    assert np.allclose(there.T_before @ back.T_before, np.eye(4), atol=1e-12)
+    assert there.icp is not None
+    assert back.icp is not None
+    assert (back.icp.points_source, back.icp.points_target) == (
+        there.icp.points_target,
+        there.icp.points_source,
+    )
+    assert there.ground_before is not None
+    assert back.ground_before is not None
+    assert there.ground_before.rise_m == pytest.approx(-(back.ground_before.rise_m or 0.0))
+    # fewer degrees of freedom are those of the source, whichever cloud that is
+    flat = refine(target, source, transforms.inverse(start), RefineSettings(motion="translation"))
+    assert np.allclose(flat.T[:3, :3], np.eye(3), atol=1e-12)
+
+
 def test_icp_is_the_same_at_each_run(clouds) -> None:
     source, target = clouds
     start = off_by(0.4, (0.5, 0.2, -0.3))

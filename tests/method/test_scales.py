@@ -12,6 +12,7 @@ from mtpcr_geo.core.types import Bev
 from mtpcr_geo.method.bev import Coverage, choose_cell, choose_cells
 from mtpcr_geo.method.scales import (
     block_for,
+    filled_share,
     ground_cell_for,
     occupied_area,
     scales_of,
@@ -47,7 +48,7 @@ def test_lengths_keep_the_limits_of_the_table(name: str) -> None:
     assert 12 * cell <= scales.patch_m <= max(24.0, 12 * cell)
     assert 3 * cell <= scales.search_radius_m <= max(6.0, 3 * cell)
     assert scales.least_overlap_m2 <= min(400.0, 0.2 * occupied_area(bev))
-    assert 1.0 <= scales.terrain_cell_m <= max(8.0, 4 * cell)
+    assert 1.0 <= scales.terrain_cell_m <= max(8.0, 4 * cell, min(scales.extent_m / 40.0, 32.0))
     assert scales.terrain_cell_m >= 4 * cell
     assert 1.0 <= scales.same_pose_m <= 12.0
     assert scales.tolerance_m == max(cell, 0.5)
@@ -61,7 +62,7 @@ def test_a_plot_a_scan_and_a_tile() -> None:
     assert (plot.cell_m, scan.cell_m, tile.cell_m) == (0.25, 0.25, 1.0)
     assert (plot.patch_m, scan.patch_m, tile.patch_m) == (5.0, 15.0, 24.0)
     assert (plot.least_overlap_m2, scan.least_overlap_m2, tile.least_overlap_m2) == (80.0, 400.0, 400.0)
-    assert (plot.terrain_cell_m, scan.terrain_cell_m, tile.terrain_cell_m) == (2.5, 7.5, 8.0)
+    assert (plot.terrain_cell_m, scan.terrain_cell_m, tile.terrain_cell_m) == (2.5, 7.5, 25.0)
     assert (plot.same_pose_m, scan.same_pose_m, tile.same_pose_m) == (2.5, 7.5, 12.0)
 
 
@@ -93,6 +94,21 @@ def test_gaps_between_the_rings_of_a_scan_count_as_seen() -> None:
     ringed = np.zeros_like(bev.count)
     ringed[::6] = 1
     assert occupied_area(replace(bev, count=ringed)) == pytest.approx(occupied_area(bev))
+
+
+def test_thin_rasters_get_larger_patches() -> None:
+    bev = full(400.0, 2.0)
+    thin = replace(bev, count=(np.random.default_rng(3).random(bev.count.shape) < 0.35).astype(np.uint32))
+    assert filled_share(bev) == pytest.approx(1.0)
+    assert filled_share(thin) == pytest.approx(0.35, rel=0.05)
+    found = scales_of(thin, thin)
+    assert found.fill == pytest.approx(0.35**2, rel=0.1)
+    assert found.fill * (found.patch_m / 2.0) ** 2 == pytest.approx(40.0, rel=0.01)
+    # but never more than half of a small site
+    small = full(40.0, 2.0)
+    few = (np.random.default_rng(4).random(small.count.shape) < 0.2).astype(np.uint32)
+    few_patch = scales_of(replace(small, count=few), small).patch_m
+    assert few_patch <= max(12 * 2.0, 40.0 / 2)
 
 
 def test_blocks_follow_the_tie_points() -> None:

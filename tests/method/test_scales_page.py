@@ -59,11 +59,12 @@ def test_rules_and_limits_are_those_of_the_code() -> None:
     limits = {row[0]: (row[1], row[2]) for row in tables()[0]}
     assert {name: limit for name, (_, limit) in limits.items()} == {
         "cell": f"{bev.FINEST_AUTO_CELL_M:g} to {bev.COARSEST_AUTO_CELL_M:g} m",
-        "patch": f"at most {s.MAX_PATCH_M:g} m",
+        "patch": f"at most {s.MAX_PATCH_M:g} m; where sparse, 1/2 the extent",
         "search radius": f"at most {s.MAX_SEARCH_RADIUS_M:g} m",
         "block": f"at most {s.MAX_BLOCK_M:g} m",
         "least overlap": f"at most {s.MAX_LEAST_OVERLAP_M2:g} m2",
-        "terrain cell": f"{s.MIN_TERRAIN_CELL_M:g} to {s.MAX_TERRAIN_CELL_M:g} m, or 4 cells",
+        "terrain cell": f"{s.MIN_TERRAIN_CELL_M:g} to {s.MAX_TERRAIN_CELL_M:g} m, or 4 cells, or "
+        f"1/{s.TERRAIN_CELLS_ACROSS:g} of the extent up to {s.MAX_WIDE_TERRAIN_CELL_M:g} m",
         "same pose": f"{s.MIN_SAME_POSE_M:g} to {s.MAX_SAME_POSE_M:g} m",
         "ground cell": f"{s.MIN_GROUND_CELL_M:g} to {s.MAX_GROUND_CELL_M:g} m",
         "tolerance": f"at least {s.MIN_TOLERANCE_M:g} m",
@@ -71,7 +72,8 @@ def test_rules_and_limits_are_those_of_the_code() -> None:
     rules = {name: rule for name, (rule, _) in limits.items()}
     assert f"{bev.POINTS_PER_CELL:g} points" in rules["cell"]
     assert f"1/{bev.CELLS_PER_EXTENT:g} of the extent, or {bev.FINEST_BY_EXTENT_M:g} m" in rules["cell"]
-    assert f"at least {s.MIN_PATCH_CELLS} cells" in rules["patch"]
+    filled = f"{s.FEWEST_FILLED_IN_PATCH} that are filled in both"
+    assert f"at least {s.MIN_PATCH_CELLS} cells and {filled}" in rules["patch"]
     assert f"at least {s.MIN_SEARCH_RADIUS_CELLS} cells" in rules["search radius"]
     assert f"1/{s.BLOCKS_PER_EXTENT:g} of" in rules["block"]
     assert f"1/{1 / s.LEAST_OVERLAP_SHARE:g} of" in rules["least overlap"]
