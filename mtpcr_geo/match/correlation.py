@@ -19,7 +19,7 @@ from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Matches
 from mtpcr_geo.match.base import margin_of
 from mtpcr_geo.match.candidates import Candidate, Pool, same_pose
-from mtpcr_geo.match.descent import follow
+from mtpcr_geo.match.descent import comb, follow
 from mtpcr_geo.match.judge import CLEAR_MARGIN, Judge
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.prior import Prior
@@ -282,17 +282,29 @@ class _Search:
             for pose in by_terrain
             if not any(same_pose(pose, other, near, radius) for other in followed[0].poses)
         ]
+        followed.append(follow(self.pyramid, factor, self._on_level(factor, others)))
         # the lowest of a cell shifts with the grid it lies on: by terrain a pose may be some metres off
-        followed += [
-            follow(self.pyramid, 1, others),
-            follow(self.pyramid, factor, self._on_level(factor, others)),
-        ]
+        combed = [comb(self.pyramid, pose, self.scales.terrain_cell_m) for pose in others]
         known = max([known, *(candidate.strength for candidate in self.judged)])
-        now, left = self.judge.judge([pose for descent in followed for pose in descent.poses], known)
+        now, left = self.judge.judge(
+            [*combed, *(pose for descent in followed for pose in descent.poses)], known
+        )
         self.judged += now
         bound = max(self.pool.bound, left, *(descent.bound for descent in followed))
         self.pool = Pool.of(self.judged, self.scales, bound)
+        if self.pool.candidates:
+            self._comb_about_the_best(known)
         return True
+
+    def _comb_about_the_best(self, known: float) -> None:
+        """Judge the best place near the best hypothesis too, where that is another."""
+        best = self.pool.candidates[0].pose
+        near = comb(self.pyramid, best, self.scales.terrain_cell_m)
+        if near.score > best.score and not same_pose(
+            near, best, self.scales.cell_m, self.scales.extent_m / 2
+        ):
+            self.judged += self.judge.judge([near], known)[0]
+            self.pool = Pool.of(self.judged, self.scales, self.pool.bound)
 
     def catch_up(self, other: _Search) -> None:
         """Search what another has searched, as far as it matters beside what that found."""

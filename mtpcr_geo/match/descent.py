@@ -23,6 +23,8 @@ FIRST_YAW_STEP_DEG = 1.0
 FIRST_YAWS: tuple[int, ...] = (-2, -1, 0, 1, 2)
 """Steps tried on the level that proposed a pose: the search over all yaws takes steps of up to 4 degrees."""
 WINDOW_CELLS = 2
+COMB_CELLS = 8
+COMB_YAWS = (-3, -2, -1, 0, 1, 2, 3)
 FEWEST_FOLLOWED = 4
 GROWTH_MARGIN = 1.25
 """Times by which the score of a hypothesis may grow on its way down beyond the most that any was seen to."""
@@ -72,9 +74,43 @@ def follow(pyramid: Pyramid, factor: int, poses: Sequence[Pose], worth: float = 
     return Descent(tuple(found))
 
 
-def _follow_one(pyramid: Pyramid, factor: int, pose: Pose) -> Pose:
+def comb(pyramid: Pyramid, pose: Pose, reach_m: float) -> Pose:
+    """Search the surroundings of a pose closely, and return the best found.
+
+    Rows and other narrow structures agree only within a fraction of a degree, over a few cells: on the way
+    down from coarse cells their true place is easily missed by a few metres.
+
+    Args:
+        pyramid: both rasters.
+        pose: about the finest centre.
+        reach_m: how far to search, metres.
+
+    """
+    level = max(1, round(reach_m / (COMB_CELLS * pyramid.source.grid.cell)))
+    finest, grid = pyramid.source.grid, pyramid.at(level)[0].grid
+    about = pose_of(pose.hypothesis(centre_of(finest)), centre_of(grid))
+    window = max(WINDOW_CELLS, round(reach_m / grid.cell))
+    # a cell at the rim, and no more than a degree
+    step = min(grid.cell / (max(grid.width, grid.height) * grid.cell / 2), np.radians(FIRST_YAW_STEP_DEG))
+    tries = [
+        score_nearby(
+            *pyramid.at(level),
+            Pose(about.yaw + k * step, about.east, about.north),
+            window,
+            ESTIMATE_CELLS,
+        )[0]
+        for k in COMB_YAWS
+    ]
+    best = max(tries, key=lambda one: one.score)
+    fine = pose_of(best.hypothesis(centre_of(grid)), centre_of(finest))
+    return _follow_one(pyramid, 1, fine, float(np.degrees(step)) / 2)
+
+
+def _follow_one(
+    pyramid: Pyramid, factor: int, pose: Pose, first_step_deg: float = FIRST_YAW_STEP_DEG
+) -> Pose:
     """Follow one pose down; its score is minus infinity where it leaves the target."""
-    level, step, yaws = factor, FIRST_YAW_STEP_DEG, FIRST_YAWS
+    level, step, yaws = factor, first_step_deg, FIRST_YAWS
     while True:
         source, target = pyramid.at(level)
         tries = {k: _nearby(pyramid, level, pose, k * step) for k in yaws}
