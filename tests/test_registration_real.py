@@ -13,6 +13,8 @@ from mtpcr_geo.benchmark.metrics import centroid_errors, rotation_error_deg
 from mtpcr_geo.core import transforms
 from mtpcr_geo.registration import Registration, register
 
+pytestmark = pytest.mark.slow
+
 # rotation in degrees and plan in metres within which each pair's truth is known, and its true height shift
 PAIRS = {
     "autzen_line_in_block": (0.1, 0.3, 0.0),
@@ -67,7 +69,6 @@ def test_a_moved_source_comes_back(name: str, shared_data: Path, tmp_path: Path)
     check(name, shared_data, 1, tmp_path)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3])
 @pytest.mark.parametrize("name", PAIRS)
 def test_every_pair_comes_back_from_any_yaw(name: str, seed: int, shared_data: Path, tmp_path: Path) -> None:
@@ -88,7 +89,6 @@ def test_clouds_of_different_places_are_not_accepted(shared_data: Path, tmp_path
     refuse("delft_urban_ahn3", "park_two_epochs_ttp", shared_data, tmp_path)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("a", "b"), [(a, b) for a in PAIRS for b in PAIRS if a != b])
 def test_no_unrelated_pair_is_accepted(a: str, b: str, shared_data: Path, tmp_path: Path) -> None:
     refuse(a, b, shared_data, tmp_path)

@@ -163,6 +163,7 @@ def test_a_place_and_a_radius(site, files):
     assert found.verdict.metrics["null_ratio"] is not None
 
 
+@pytest.mark.slow
 def test_longitude_and_latitude(site, files):
     lon, lat = Transformer.from_crs(UTM33, "EPSG:4326", always_xy=True).transform(*site.place[:2])
     found = mg.register(*files, source_crs="local", near=(lon, lat), near_crs="EPSG:4326", yaw=YAW_DEG + 8.0)
@@ -184,6 +185,7 @@ def test_a_matrix_that_is_off_does_not_decide(site, files):
     assert assessed["prior_kept"] is False
 
 
+@pytest.mark.slow
 def test_a_transform_json_and_a_text_file(site, files, tmp_path):
     scan, tile = files
     mg.register(scan, tile, tmp_path / "first", source_crs="local", recording=False)
@@ -228,6 +230,7 @@ def test_no_prior_forgets_all_of_it(monkeypatch):
     assert given["o"] == RegisterOptions()
 
 
+@pytest.mark.slow
 def test_a_far_shift_of_both_changes_nothing(site):
     far = np.array([5_000_000.0, -5_000_000.0, 0.0])
     found = []
@@ -341,6 +344,7 @@ def test_check_says_where_a_place_lies(site, files):
         check_clouds(files[1], near=(1.0, 2.0))
 
 
+@pytest.mark.slow
 def test_a_prior_that_is_wrong_is_not_borne_out(site, files):
     for options in (
         {"near": tuple(site.place[:2] + [-36.0, 27.0]), "within": 15.0},
