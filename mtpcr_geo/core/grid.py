@@ -54,6 +54,11 @@ class Grid:
         row = np.floor((self.north - xy[:, 1]) * scale).astype(np.int64)
         return column, row
 
+    def part(self, rows: slice, columns: slice) -> Grid:
+        """Return the grid of some rows and columns, each from start to stop and inside this one."""
+        west, north = self.west + columns.start * self.cell, self.north - rows.start * self.cell
+        return Grid(west, north, self.cell, columns.stop - columns.start, rows.stop - rows.start)
+
     def holds(self, column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which of (n,) columns and rows lie in the grid."""
         return (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)

@@ -113,11 +113,5 @@ class Prior:
         row0, row1 = (int(np.clip(v, 0, target.height)) for v in (np.floor(row0), np.ceil(row1)))
         if column1 <= column0 or row1 <= row0:
             return None
-        grid = Grid(
-            target.west + column0 * target.cell,
-            target.north - row0 * target.cell,
-            target.cell,
-            column1 - column0,
-            row1 - row0,
-        )
-        return grid, slice(row0, row1), slice(column0, column1)
+        rows, columns = slice(row0, row1), slice(column0, column1)
+        return target.part(rows, columns), rows, columns

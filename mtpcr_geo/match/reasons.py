@@ -31,8 +31,8 @@ def nothing_to_compare(source: Bev, target: Bev, wanted_cells: float, near_prior
         )
     if near_prior:
         return (
-            f"{text}, and none within the range of the prior does; widen it (options prior_sigma, "
-            "prior_yaw), or search without the prior"
+            f"{text}, and none within the range of the prior does; widen it (options within, "
+            "yaw_tolerance), or search without the prior"
         )
     return (
         f"{text} (the source fills {filled['source']:,}, the target {filled['target']:,}); they lie in "

@@ -276,13 +276,7 @@ def _target_under(source: Grid, target: Grid, pose: Pose, margin: int) -> tuple[
     row0 = int(np.clip(np.floor(px[:, 1].min()) - margin, 0, target.height))
     column1 = int(np.clip(np.ceil(px[:, 0].max()) + margin + 1, column0, target.width))
     row1 = int(np.clip(np.ceil(px[:, 1].max()) + margin + 1, row0, target.height))
-    part = Grid(
-        target.west + column0 * target.cell,
-        target.north - row0 * target.cell,
-        target.cell,
-        column1 - column0,
-        row1 - row0,
-    )
+    part = target.part(slice(row0, row1), slice(column0, column1))
     return part, (row0, column0)
 
 

@@ -12,7 +12,7 @@ from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import MissingPartError, OptionError
 from mtpcr_geo.pipeline import safety
 from mtpcr_geo.pipeline.grammar import StageSpec, file_of
-from mtpcr_geo.pipeline.pdal import library
+from mtpcr_geo.pipeline.pdal import bindings
 from mtpcr_geo.pipeline.registry import make_options, stage_types, unknown_type
 from mtpcr_geo.pipeline.stage import Node, Stage
 from mtpcr_geo.pipeline.stages.memory import MemoryReader
@@ -90,15 +90,15 @@ def _needs_pdal(spec: StageSpec) -> bool:
     own = stage_types()
     if not spec.type.startswith(_PDAL_FAMILIES):
         if spec.type not in own:
-            known = [*own, *library.drivers()] if library.available() else list(own)
+            known = [*own, *bindings.drivers()] if bindings.available() else list(own)
             raise unknown_type(spec.label, spec.type, known)
         return False
     if spec.type in own:
         return not _we_can(spec) and _pdal_has(spec)
-    if not library.available():
-        raise MissingPartError(f"{spec.label} needs PDAL, which is not installed; {library.INSTALL}")
+    if not bindings.available():
+        raise MissingPartError(f"{spec.label} needs PDAL, which is not installed; {bindings.INSTALL}")
     if not _pdal_has(spec):
-        raise unknown_type(spec.label, spec.type, [*own, *library.drivers()])
+        raise unknown_type(spec.label, spec.type, [*own, *bindings.drivers()])
     return True
 
 
@@ -112,7 +112,7 @@ def _we_can(spec: StageSpec) -> bool:
 
 
 def _pdal_has(spec: StageSpec) -> bool:
-    return library.available() and spec.type in library.drivers()
+    return bindings.available() and spec.type in bindings.drivers()
 
 
 def _connect(specs: Sequence[StageSpec], stages: Mapping[str, Stage]) -> None:

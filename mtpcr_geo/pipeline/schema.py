@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mtpcr_geo.pipeline.pdal import library
+from mtpcr_geo.pipeline.pdal import bindings
 from mtpcr_geo.pipeline.registry import stage_types
 
 _TAG = {"type": "string", "pattern": "^[A-Za-z][A-Za-z0-9_]*$", "description": "name of this stage"}
@@ -19,9 +19,9 @@ def pipeline_schema() -> dict[str, Any]:
     """Return the JSON Schema of a pipeline: our stages in full, and PDAL's as far as PDAL is here to ask."""
     definitions: dict[str, Any] = {}
     stages = [_own(kind, definitions) for kind in stage_types()]
-    if library.available():
+    if bindings.available():
         known = stage_types()
-        stages += [_pdal(driver) for driver in library.drivers().values() if driver.name not in known]
+        stages += [_pdal(driver) for driver in bindings.drivers().values() if driver.name not in known]
     else:
         pattern = {"type": "string", "pattern": "^(readers|filters|writers)\\."}
         stages.append({"type": "object", "required": ["type"], "properties": {"type": pattern}})
@@ -68,7 +68,7 @@ def _own(kind: str, definitions: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _pdal(driver: library.Driver) -> dict[str, Any]:
+def _pdal(driver: bindings.Driver) -> dict[str, Any]:
     options = {
         name: {**_REPEATABLE, "description": description} for name, description in driver.options.items()
     }

@@ -158,7 +158,7 @@ def test_validating_reads_no_point(town_files, monkeypatch):
         raise AssertionError("a point was read")
 
     monkeypatch.setattr(LasCloud, "record_chunks", read)
-    monkeypatch.setattr("mtpcr_geo.pipeline.pdal.library.available", lambda: False)
+    monkeypatch.setattr("mtpcr_geo.pipeline.pdal.bindings.available", lambda: False)
     source, target = map(str, town_files)
     bounds = "([0, 1], [0, 1])"
     mg.Pipeline(

@@ -265,7 +265,7 @@ def test_broken_by_pdal_is_found_by_validation(name, place, pdal):
 
 
 def test_without_pdal_its_stages_say_how_to_get_it(place, monkeypatch):
-    monkeypatch.setattr("mtpcr_geo.pipeline.pdal.library.available", lambda: False)
+    monkeypatch.setattr("mtpcr_geo.pipeline.pdal.bindings.available", lambda: False)
     line, exit_code = complaint(place, json.dumps([TARGET, {"type": "filters.outlier", "tag": "o"}, OUT]))
     assert "stage o (filters.outlier) needs PDAL" in line
     assert "conda-forge" in line

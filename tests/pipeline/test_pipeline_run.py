@@ -90,7 +90,7 @@ def test_another_seed_is_in_the_dump(town_files, tmp_path):
 
 @pytest.mark.parametrize("name", WITHOUT_PDAL)
 def test_ready_pipelines_without_pdal(name, town_files, tmp_path, monkeypatch):
-    monkeypatch.setattr("mtpcr_geo.pipeline.pdal.library.available", lambda: False)
+    monkeypatch.setattr("mtpcr_geo.pipeline.pdal.bindings.available", lambda: False)
     monkeypatch.chdir(tmp_path)
     source, target = town_files
     pipeline = mtpcr_geo.Pipeline(ready(name), [f"--target.filename={target}", f"--source.filename={source}"])
@@ -108,7 +108,7 @@ def test_ready_pipelines_without_pdal(name, town_files, tmp_path, monkeypatch):
 def test_bev_only(town_files, tmp_path, monkeypatch):
     import rasterio
 
-    monkeypatch.setattr("mtpcr_geo.pipeline.pdal.library.available", lambda: False)
+    monkeypatch.setattr("mtpcr_geo.pipeline.pdal.bindings.available", lambda: False)
     monkeypatch.chdir(tmp_path)
     pipeline = mtpcr_geo.Pipeline(
         ready("bev_only"), [f"--readers.las.filename={town_files[1]}", "--bev.cell=2"]
@@ -128,7 +128,7 @@ def test_composite_gives_what_its_steps_give(registered, town_files):
 
 
 def test_crop_count_and_arrays_without_pdal(town_files, monkeypatch):
-    monkeypatch.setattr("mtpcr_geo.pipeline.pdal.library.available", lambda: False)
+    monkeypatch.setattr("mtpcr_geo.pipeline.pdal.bindings.available", lambda: False)
     target = laspy.read(town_files[1])
     x, y = np.asarray(target.x), np.asarray(target.y)
     low = [x.min() + 20.0, y.min() + 30.0]

@@ -45,7 +45,7 @@ def test_on_real_data(name, pdal_there, shared_data, tmp_path, monkeypatch, requ
     elif name in NEEDS_PDAL:
         pytest.skip("this pipeline needs PDAL, and says so")
     else:
-        monkeypatch.setattr("mtpcr_geo.pipeline.pdal.library.available", lambda: False)
+        monkeypatch.setattr("mtpcr_geo.pipeline.pdal.bindings.available", lambda: False)
     pipeline = run(name, shared_data / "coast_town_sparse_ign382")
     assert all(path.exists() for path in pipeline.outputs)
     if name == "bev_only":

@@ -16,7 +16,7 @@ from mtpcr_geo.io.dimensions import separate_legacy_flags
 from mtpcr_geo.io.las import LasCloud
 from mtpcr_geo.io.views import Moved, xyz_of
 from mtpcr_geo.io.write import write_cloud
-from mtpcr_geo.pipeline.pdal import library
+from mtpcr_geo.pipeline.pdal import bindings
 from mtpcr_geo.pipeline.pdal.step import (
     Step,
     failure,
@@ -62,7 +62,7 @@ class PdalCloud(Cloud):
         self._steps = _steps_before(self.step)
         chain = self._chain(context)
         writers = [step for step in self._steps if is_writer(step.spec) and not step.written]
-        pipeline = library.pipeline(chain)
+        pipeline = bindings.pipeline(chain)
         with context.progress.task(f"PDAL: {self.step.tag}"):
             streamed = pipeline.streamable
             metadata = self._stream_first(pipeline) if streamed else self._execute(chain, need_crs)
@@ -128,7 +128,7 @@ class PdalCloud(Cloud):
         size = 0
         with _blamed(self._steps):
             iterator = pipeline.iterator(chunk_size=CHUNK_POINTS, prefetch=1)
-            for records in library.arrays_of(iterator):
+            for records in bindings.arrays_of(iterator):
                 self._note(records)
                 size += records.nbytes
                 if kept is not None and size <= _KEEP_BYTES:
@@ -144,7 +144,7 @@ class PdalCloud(Cloud):
 
         # PDAL tells the CRS of what went into the last stage; and our stages take one cloud
         last = [{"type": "filters.merge", "tag": "mtpcr_merged"}] if need_crs else []
-        pipeline = library.pipeline([*chain, *last])
+        pipeline = bindings.pipeline([*chain, *last])
         with _blamed(self._steps):
             pipeline.execute()
             self._held = list(pipeline.arrays)
@@ -164,15 +164,15 @@ class PdalCloud(Cloud):
 
     def _stream(self, chain: Sequence[Mapping[str, Any]], size: int) -> Iterator[Records]:
         with _blamed(self._steps):
-            iterator = library.pipeline(chain).iterator(chunk_size=size, prefetch=1)
-            yield from library.arrays_of(iterator)
+            iterator = bindings.pipeline(chain).iterator(chunk_size=size, prefetch=1)
+            yield from bindings.arrays_of(iterator)
 
     def _probed_crs(self) -> CRS | None:
         """Ask for the CRS by a run over one point of each reader."""
         from pyproj import CRS
 
         chain = [{**stage, "count": 1} if "inputs" not in stage else stage for stage in self._again]
-        pipeline = library.pipeline([*chain, {"type": "filters.merge", "tag": "mtpcr_merged"}])
+        pipeline = bindings.pipeline([*chain, {"type": "filters.merge", "tag": "mtpcr_merged"}])
         with _blamed(self._steps):
             pipeline.execute()
             wkt = pipeline.srswkt2
@@ -185,7 +185,7 @@ def _blamed(steps: Sequence[Step]) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, ValueError, TypeError) as error:
-        message = library.first_line(error)
+        message = bindings.first_line(error)
         named = [step for step in steps if message.startswith(f"{step.spec.type}:")]
         if len(named) == 1 or len(steps) == 1:
             raise failure((named or list(steps))[0].spec, message) from error

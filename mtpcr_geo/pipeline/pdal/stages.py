@@ -12,7 +12,7 @@ from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.suggestions import meant
 from mtpcr_geo.pipeline.grammar import StageSpec, file_of
-from mtpcr_geo.pipeline.pdal import library
+from mtpcr_geo.pipeline.pdal import bindings
 from mtpcr_geo.pipeline.pdal.cloud import PdalCloud
 from mtpcr_geo.pipeline.pdal.step import Step, failure, file_written, is_reader, stage_json
 from mtpcr_geo.pipeline.stage import RunContext, Stage, StageOptions, Value
@@ -62,7 +62,7 @@ class PdalStage(Stage):
         """Let PDAL prepare everything up to this stage, without running it."""
         chain: dict[str, dict[str, Any]] = {}
         guessed = self._prepared(chain)
-        problem = library.problem_of(list(chain.values()))
+        problem = bindings.problem_of(list(chain.values()))
         # without the true cloud, PDAL cannot know which dimensions there will be
         if problem and not (guessed and "dimension" in problem.lower()):
             raise failure(self.spec, problem, preparing=True)
@@ -106,7 +106,7 @@ def make_pdal_stage(spec: StageSpec) -> PdalStage:
         OptionError: if this PDAL does not know the stage, or an option of it.
 
     """
-    drivers = library.drivers()
+    drivers = bindings.drivers()
     if spec.type not in drivers:
         raise OptionError(f"{spec.label}: this PDAL has no stage {spec.type!r}{meant(spec.type, drivers)}")
     known = drivers[spec.type].options
