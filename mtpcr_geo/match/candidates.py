@@ -84,8 +84,7 @@ class Pool:
     @classmethod
     def of(cls, candidates: Sequence[Candidate], scales: Scales, bound: float = 0.0) -> Pool:
         """Rank candidates by strength and the ground, and join those that came down to the same place."""
-        known = [c.ground.spread_m for c in candidates if c.ground is not None and c.ground.known]
-        least = min(known, default=0.0)
+        least = least_spread(candidates)
         weighed = [(c.strength * _ground_factor(c.ground, least), c) for c in candidates]
         weighed.sort(key=lambda one: (-one[0], -one[1].pose.score))
         kept: list[tuple[float, Candidate]] = []
@@ -102,12 +101,37 @@ class Pool:
         """Strength of the best over that of the next distinct hypothesis, at least."""
         return margin_of(self.strengths, floor=self.bound)
 
+    def over(self, other: Pool) -> float:
+        """Return the strength of the best over the greatest of another pool, at least.
+
+        The ground weighs in both alike, held against the least spread of either: a lattice of rows fits the
+        rows of its mirror image as well as its own, but not the terrain beneath.
+        """
+        mine, theirs = (
+            [c for c in pool.candidates if c.ground is not None and c.ground.known] for pool in (self, other)
+        )
+        least = min(least_spread(mine), least_spread(theirs)) if mine and theirs else None
+        if least is None:
+            best, rivals = self.candidates[0].strength, [c.strength for c in other.candidates]
+        else:
+            best = self.candidates[0].strength * _ground_factor(self.candidates[0].ground, least)
+            rivals = [c.strength * _ground_factor(c.ground, least) for c in other.candidates]
+        return margin_of([best, max(rivals, default=0.0)], floor=other.bound)
+
+
+def least_spread(candidates: Sequence[Candidate]) -> float:
+    """Return the least spread of the ground's height differences of all candidates, metres; 0 if unknown."""
+    known = [c.ground.spread_m for c in candidates if c.ground is not None and c.ground.known]
+    return min(known, default=0.0)
+
 
 def _ground_factor(ground: GroundComparison | None, least_m: float) -> float:
     """Return 1 where the grounds agree as well as they do anywhere, less where they differ in shape."""
+    scale = GROUND_SCALE_M + least_m
+    full = 1.0 + (least_m / scale) ** 2
     if ground is None or not ground.known:
-        return 0.5
-    return 1.0 / (1.0 + (ground.spread_m / (GROUND_SCALE_M + least_m)) ** 2)
+        return 0.5 * full
+    return full / (1.0 + (ground.spread_m / scale) ** 2)
 
 
 def same_pose(a: Pose, b: Pose, apart_m: float, radius_m: float) -> bool:

@@ -17,7 +17,6 @@ import numpy as np
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Matches
-from mtpcr_geo.match.base import margin_of
 from mtpcr_geo.match.candidates import Candidate, Pool, same_pose
 from mtpcr_geo.match.descent import comb, follow
 from mtpcr_geo.match.judge import CLEAR_MARGIN, Judge
@@ -128,7 +127,7 @@ def match(
             break
         if twin is not None and search.promises():
             twin.catch_up(search)
-            if search.over(twin) >= CONVINCING_NULL_RATIO:
+            if search.pool.over(twin.pool) >= CONVINCING_NULL_RATIO:
                 break
     pool = search.pool
     if not pool.candidates:
@@ -136,7 +135,7 @@ def match(
     null_ratio = None
     if twin is not None:
         twin.catch_up(search)
-        null_ratio = search.over(twin)
+        null_ratio = search.pool.over(twin.pool)
     best = pool.candidates[0]
     patches = best.patches
     assert patches is not None  # hypotheses in a pool are judged by patches
@@ -311,11 +310,6 @@ class _Search:
         known = other.pool.candidates[0].strength if other.pool.candidates else 0.0
         for factor, part in other.done[len(self.done) :]:
             self.explore(factor, part, known)
-
-    def over(self, other: _Search) -> float:
-        """Return the strength of the best over the greatest of another search, at least."""
-        strongest = max((candidate.strength for candidate in other.pool.candidates), default=0.0)
-        return margin_of([self.pool.candidates[0].strength, strongest], floor=other.pool.bound)
 
     def convinces(self) -> bool:
         """Return whether the best hypothesis is beyond doubt by itself."""

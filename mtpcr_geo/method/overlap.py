@@ -21,6 +21,73 @@ SLOPE_RADIUS_M = 8.0
 GROUND_LAYER_M = 0.3
 STEEPEST = 1.0
 """Slope, rise over run, beyond which steps count as walls and not as ground."""
+BLOCKS, FEWEST_BLOCKS, FEWEST_IN_BLOCK = 100, 12, 4
+"""Blocks in which the shapes of two grounds are compared, where there is room; the fewest that tell; and the
+fewest cells of ground in one."""
+LARGEST_BLOCK_M = 16.0
+
+
+@dataclass(frozen=True)
+class CommonGround:
+    """Heights of the ground in cells where both clouds see it.
+
+    Attributes:
+        xy: (n, 2) centres of the cells, metres.
+        source, target: (n,) heights of either cloud's ground there, metres.
+        cell: edge of a cell, metres.
+
+    """
+
+    xy: Floats
+    source: Floats
+    target: Floats
+    cell: float
+
+    @property
+    def step(self) -> Floats:
+        """Target minus source heights, (n,) metres."""
+        return np.asarray(self.target - self.source)
+
+    def shape(self) -> GroundShape:
+        """Compare the shapes of both grounds, in blocks large enough that grass and brush average out.
+
+        A block's height is the median of its cells. Relief is what is left of the heights after one plane:
+        two slopes that fall alike are no sign of one place.
+        """
+        side = min(np.sqrt(len(self.xy) / BLOCKS) * self.cell, LARGEST_BLOCK_M)
+        side = float(max(side, np.sqrt(2.0 * FEWEST_IN_BLOCK) * self.cell))
+        column, row = np.floor(self.xy / side).astype(np.int64).T
+        _, number = np.unique(np.column_stack([column, row]), axis=0, return_inverse=True)
+        order = np.argsort(number.ravel(), kind="stable")
+        starts = np.flatnonzero(np.diff(number.ravel()[order], prepend=-1))
+        parts = [part for part in np.split(order, starts[1:]) if len(part) >= FEWEST_IN_BLOCK]
+        if len(parts) < FEWEST_BLOCKS:
+            return GroundShape(len(parts), np.inf, 0.0)
+        xy = np.array([self.xy[part].mean(axis=0) for part in parts])
+        step = np.array([np.median(self.step[part]) for part in parts])
+        reliefs = [
+            _robust_spread(_without_plane(xy, np.array([np.median(z[part]) for part in parts])))
+            for z in (self.source, self.target)
+        ]
+        return GroundShape(len(parts), _robust_spread(step), float(np.sqrt(np.mean(np.square(reliefs)))))
+
+
+@dataclass(frozen=True)
+class GroundShape:
+    """How the shapes of both grounds compare.
+
+    Attributes:
+        blocks: number of blocks compared.
+        spread_m: robust standard deviation of their height differences about the median, metres; infinite
+            where too few blocks could be compared.
+        relief_m: robust standard deviation of the heights themselves about a plane, metres. Of places that
+            have nothing to do with each other the heights differ by about 1.4 times this.
+
+    """
+
+    blocks: int
+    spread_m: float
+    relief_m: float
 
 
 @dataclass(frozen=True)
@@ -59,15 +126,11 @@ class Overlap:
         found[inside] = self.shared[row[inside], column[inside]]
         return found
 
-    def ground_steps(self) -> tuple[Floats, Floats]:
-        """Compare the heights of the ground where both see it.
+    def common_ground(self) -> CommonGround:
+        """Return the heights of the ground where both clouds see it.
 
         Cells count whose lowest points lie low among their neighbours in both clouds: not on roofs, not
         in crowns.
-
-        Returns:
-            (n, 2) cell centres in metres, and (n,) target minus source heights in metres.
-
         """
         both = (self.source.count > 0) & (self.target.count > 0)
         both &= _lies_low(self.source.low, self.grid.cell) & _lies_low(self.target.low, self.grid.cell)
@@ -76,8 +139,17 @@ class Overlap:
         heights = [
             _ground(xyz, bev) for xyz, bev in zip(self.points, (self.source, self.target), strict=True)
         ]
-        step = (heights[1] - heights[0])[both]
-        return xy, step
+        return CommonGround(xy, heights[0][both], heights[1][both], self.grid.cell)
+
+    def ground_steps(self) -> tuple[Floats, Floats]:
+        """Compare the heights of the ground where both see it.
+
+        Returns:
+            (n, 2) cell centres in metres, and (n,) target minus source heights in metres.
+
+        """
+        ground = self.common_ground()
+        return ground.xy, ground.step
 
 
 def overlap_of(
@@ -164,3 +236,14 @@ def _lies_low(low: NDArray[np.float32], cell: float, above: float = LOW_ABOVE_M)
     allowed = np.float32(above) + _slope(low, cell) * np.float32(radius * cell)
     with np.errstate(invalid="ignore"):
         return np.asarray(filled & (low - _lowest_near(low, cell) < allowed))
+
+
+def _without_plane(xy: Floats, z: Floats) -> Floats:
+    """Take the least-squares plane from (n,) heights at (n, 2) places."""
+    A = np.column_stack([np.ones(len(xy)), xy - xy.mean(axis=0)])
+    return np.asarray(z - A @ np.linalg.lstsq(A, z, rcond=None)[0])
+
+
+def _robust_spread(values: Floats) -> float:
+    """Return the standard deviation of (n,) values as their median deviation tells it."""
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))

@@ -55,6 +55,8 @@ class Evidence:
         overlap_source, overlap_target: shares of each cloud's area that lie in the overlap.
         ground_cells: cells where both see the ground.
         ground_agreeing: of these, cells whose heights agree.
+        ground_spread_m, ground_relief_m: spread of the height differences between both grounds, and relief
+            that they have, metres, see `method.overlap.GroundShape`; None where it was not to be told.
         refined_away_m: how far the refinement moved the overlap from the solution in plan, metres.
         final_agreeing: of all tie points, those that agree with the final transform; None if not counted.
         refinement_lost: whether surfaces fit better where the tie points do not agree, and the tie points
@@ -81,6 +83,8 @@ class Evidence:
     null_ratio: float | None = None
     least_overlap_m2: float = 400.0
     contradictions: tuple[str, ...] = ()
+    ground_spread_m: float | None = None
+    ground_relief_m: float | None = None
     missing: str | None = None
     rivals: tuple[Rival, ...] = ()
     mapped: bool = True
@@ -162,6 +166,8 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
         "ground_cells": evidence.ground_cells,
         "ground_agreeing": evidence.ground_agreeing,
         "ground_checked": ground_checked(evidence),
+        "ground_spread_m": evidence.ground_spread_m,
+        "ground_relief_m": evidence.ground_relief_m,
         "refined_away_m": evidence.refined_away_m,
     }
     notes = not_checked(evidence, name)

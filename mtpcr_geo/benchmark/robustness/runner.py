@@ -42,6 +42,10 @@ FIGURES = (
     "ground_agreeing", "ground_cells", "held_out_tie_points", "held_out_agreeing",
 )  # fmt: skip
 """Figures of the verdict that have a column of their own; the column `metrics` holds all of them."""
+MATCHER_FIGURES = (
+    "extent_m", "margin", "mirrored_strengths", "neg_log10_p", "scores", "strengths", "support_next",
+)  # fmt: skip
+"""Figures of the matcher's own report that `metrics` keeps."""
 COLUMNS = (*LABELS, *SCENE, *ANSWER, *FIGURES, "reason", "middle", "T_answer_true", "metrics")
 """Columns of a row, in order; see `run_case`."""
 
@@ -197,6 +201,7 @@ def _figures(found: Registration) -> Row:
             for one in matches.hypotheses[:STRENGTHS]
         ]
         metrics["cell_m"] = float(found.pair.cell)
+        metrics["matcher"] = {key: matches.report.get(key) for key in MATCHER_FIGURES}
     metrics["stage_s"] = {stage.type: round(stage.seconds, 3) for stage in found.report}
     row = {name: metrics.get(name) for name in FIGURES}
     return row | {"metrics": json.loads(json.dumps(plain(metrics)))}
