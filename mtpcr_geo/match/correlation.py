@@ -18,7 +18,7 @@ from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Matches
 from mtpcr_geo.match.candidates import Candidate, Pool, same_pose
-from mtpcr_geo.match.descent import comb, follow
+from mtpcr_geo.match.descent import comb, comb_each, follow
 from mtpcr_geo.match.judge import CLEAR_MARGIN, Judge
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.prior import Prior
@@ -283,7 +283,7 @@ class _Search:
         ]
         followed.append(follow(self.pyramid, factor, self._on_level(factor, others)))
         # the lowest of a cell shifts with the grid it lies on: by terrain a pose may be some metres off
-        combed = [comb(self.pyramid, pose, self.scales.terrain_cell_m) for pose in others]
+        combed = comb_each(self.pyramid, others, self.scales.terrain_cell_m)
         known = max([known, *(candidate.strength for candidate in self.judged)])
         now, left = self.judge.judge(
             [*combed, *(pose for descent in followed for pose in descent.poses)], known

@@ -74,6 +74,12 @@ def follow(pyramid: Pyramid, factor: int, poses: Sequence[Pose], worth: float = 
     return Descent(tuple(found))
 
 
+def comb_each(pyramid: Pyramid, poses: Sequence[Pose], reach_m: float) -> list[Pose]:
+    """Search the surroundings of several poses closely, see `comb`."""
+    with ThreadPoolExecutor(usable_cores()) as threads:
+        return list(threads.map(lambda pose: comb(pyramid, pose, reach_m), poses))
+
+
 def comb(pyramid: Pyramid, pose: Pose, reach_m: float) -> Pose:
     """Search the surroundings of a pose closely, and return the best found.
 

@@ -22,6 +22,8 @@ Floats = NDArray[np.float64]
 
 FEWEST_GROUND_CELLS = 30
 FEWEST_HELD_OUT = 4
+FLAT_GROUND_M = 0.15
+"""Spread of the height differences below which they are noise, and say nothing of the ground's shape."""
 LITTLE_SHARED = 0.2
 MOST_NAMED = 3
 KEPT_SHARE = 0.5
@@ -106,6 +108,9 @@ class Limits:
         refined_away: most tolerances by which the refinement may move the overlap away from the tie points.
         ground_agreeing: share of the common ground that must agree in height to accept, where any is seen.
             Of flat ground 60 to 66 % agrees under poses a whole block off, and 74 % and more under true ones.
+        ground_shape: most spread of the height differences between both grounds, as a share of the relief
+            that they have, to accept. Of two places that have nothing to do with each other it is 1.4; under
+            true poses of repeating sites it is 0.2 at most, under wrong ones 1.0 to 1.7.
 
     """
 
@@ -117,6 +122,7 @@ class Limits:
     overlap_m2: float | None = None
     refined_away: float = 2.0
     ground_agreeing: float = 0.7
+    ground_shape: float = 0.6
 
 
 def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = None) -> Verdict:
@@ -135,6 +141,7 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
         margin_finding(evidence, limits),
         *refinement_findings(evidence, limits),
         ground_finding(evidence, limits),
+        ground_shape_finding(evidence, limits),
         null_finding(evidence, limits),
         overlap_finding(evidence, limits),
     ]
@@ -371,6 +378,21 @@ def ground_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
         f"only {value} of the ground that both clouds see agrees in height (wanted {wanted}, "
         f"{evidence.ground_cells} cells compared): the place is wrong, one cloud leans, or the ground has "
         "changed"
+    )
+
+
+def ground_shape_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
+    """Judge whether the shape of the ground is the same in both clouds, where it has one.
+
+    Where it has little relief, heights of any two places agree within what counts as agreement.
+    """
+    spread, relief = evidence.ground_spread_m, evidence.ground_relief_m
+    if spread is None or relief is None or spread < FLAT_GROUND_M or spread <= limits.ground_shape * relief:
+        return None
+    return CheckFinding(
+        f"the ground of the two clouds differs in shape by {spread:.2f} m, where it rises and falls by "
+        f"{relief:.2f} m in each (wanted at most {limits.ground_shape * relief:.2f} m): the place is wrong, or "
+        "the ground has changed"
     )
 
 
