@@ -391,8 +391,8 @@ def ground_shape_finding(evidence: Evidence, limits: Limits) -> CheckFinding | N
         return None
     return CheckFinding(
         f"the ground of the two clouds differs in shape by {spread:.2f} m, where it rises and falls by "
-        f"{relief:.2f} m in each (wanted at most {limits.ground_shape * relief:.2f} m): the place is wrong, or "
-        "the ground has changed"
+        f"{relief:.2f} m in each (wanted at most {limits.ground_shape * relief:.2f} m): the place is wrong, "
+        "or the ground has changed"
     )
 
 
