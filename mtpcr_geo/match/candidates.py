@@ -33,6 +33,8 @@ class Candidate:
         patches: local matches under it, where it was judged by them.
         supporting: (n,) patches that agree on one pose.
         ground: how the shapes of both grounds compare under it.
+        complete: whether it was judged at the finest cells; else its patches are those of a first look, on
+            the rasters of a coarser level.
 
     """
 
@@ -40,6 +42,7 @@ class Candidate:
     patches: PatchMatches | None = None
     supporting: Mask | None = None
     ground: GroundComparison | None = None
+    complete: bool = True
 
     @property
     def support(self) -> float:

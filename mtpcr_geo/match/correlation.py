@@ -27,6 +27,7 @@ from mtpcr_geo.match.reasons import nothing_to_compare
 from mtpcr_geo.match.search import GlobalSearch, Layer, distinct
 from mtpcr_geo.match.terrain import FEWEST_CELLS as FEWEST_GROUND_CELLS
 from mtpcr_geo.match.terrain import Terrain, TerrainSearch, closest, place_on
+from mtpcr_geo.method.ground import bare
 from mtpcr_geo.method.scales import Scales, scales_of
 
 COARSEST_YAW_STEP_DEG, FINEST_YAW_STEP_DEG = 4.0, 2.0
@@ -223,7 +224,11 @@ class _Search:
     ) -> None:
         self.pyramid = Pyramid(source, target, shared)
         self.scales, self.settings, self.advance, self.prior = scales, settings, advance, prior
-        self.terrain = (Terrain.of(source, scales.terrain_cell_m), Terrain.of(target, scales.terrain_cell_m))
+        self.bare = (bare(source), bare(target))
+        self.terrain = (
+            Terrain.of(self.bare[0], scales.terrain_cell_m),
+            Terrain.of(self.bare[1], scales.terrain_cell_m),
+        )
         self.judge = Judge(
             self.pyramid,
             self.terrain,
@@ -290,10 +295,19 @@ class _Search:
         )
         self.judged += now
         bound = max(self.pool.bound, left, *(descent.bound for descent in followed))
-        self.pool = Pool.of(self.judged, self.scales, bound)
+        self._rank(bound)
         if self.pool.candidates:
             self._comb_about_the_best(known)
         return True
+
+    def _rank(self, bound: float) -> None:
+        """Rank what was judged; the best is judged at the finest cells, if a first look had been enough."""
+        self.pool = Pool.of(self.judged, self.scales, bound)
+        while self.pool.candidates and not self.pool.candidates[0].complete:
+            best = self.pool.candidates[0]
+            number = next(k for k, one in enumerate(self.judged) if one is best)
+            self.judged[number] = self.judge.judge_one(best.pose)
+            self.pool = Pool.of(self.judged, self.scales, bound)
 
     def _comb_about_the_best(self, known: float) -> None:
         """Judge the best place near the best hypothesis too, where that is another."""
@@ -303,7 +317,7 @@ class _Search:
             near, best, self.scales.cell_m, self.scales.extent_m / 2
         ):
             self.judged += self.judge.judge([near], known)[0]
-            self.pool = Pool.of(self.judged, self.scales, self.pool.bound)
+            self._rank(self.pool.bound)
 
     def catch_up(self, other: _Search) -> None:
         """Search what another has searched, as far as it matters beside what that found."""
@@ -378,10 +392,7 @@ class _Search:
             count: how many to propose at most.
 
         """
-        source, target = (
-            Terrain.of(bev, max(cell_m, self.scales.cell_m))
-            for bev in (self.pyramid.source, self.pyramid.target)
-        )
+        source, target = (Terrain.of(bev, max(cell_m, self.scales.cell_m)) for bev in self.bare)
         cell, prior = source.grid.cell, self.prior
         reached = target if prior is None else prior.terrain(source.grid, target)
         if reached is None or min(source.mask.sum(), reached.mask.sum()) < 4 * FEWEST_GROUND_CELLS:

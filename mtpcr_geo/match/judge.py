@@ -97,7 +97,7 @@ class Judge:
         factor = 2 if self.patch_m >= WIDE_PATCH_CELLS * cell else 1
         radius = min(max(self.radius_cells, round(self.search_radius_m / cell)), MAX_RADIUS_CELLS)
         patches, supporting = self._patches(factor, pose, max(1, round(radius / factor)))
-        first = Candidate(pose, patches, supporting, self._compare_ground(pose))
+        first = Candidate(pose, patches, supporting, self._compare_ground(pose), complete=False)
         if FAINT * first.strength < known:
             return first
         corrected = _corrected(pose, patches, supporting, self.pyramid.at(factor), self._agree_m, fine[0])

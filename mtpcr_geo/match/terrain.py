@@ -47,7 +47,7 @@ class Terrain:
 
     @classmethod
     def of(cls, bev: Bev, cell_m: float) -> Terrain:
-        """Make it of a height raster, in cells of about ``cell_m`` metres."""
+        """Make it of a height raster of the bare ground, in cells of about ``cell_m`` metres."""
         coarse = coarsen(bev, max(1, round(cell_m / bev.grid.cell)))
         filled = coarse.count > 0
         middle = np.median(coarse.low[filled]) if filled.any() else np.float32(0.0)

@@ -122,7 +122,7 @@ class Limits:
     overlap_m2: float | None = None
     refined_away: float = 2.0
     ground_agreeing: float = 0.7
-    ground_shape: float = 0.6
+    ground_shape: float = 0.35
 
 
 def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = None) -> Verdict:
