@@ -43,6 +43,13 @@ def benchmark(
             "then the folder of real pairs."
         ),
     ] = None,
+    calibrate: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Fit the verdict's probability to these files of rows (robustness.csv) instead, and show it "
+            "on the sites that it was not fitted to."
+        ),
+    ] = None,
     starts: Annotated[int, typer.Option(min=1, help="Random starts of each pair.")] = 10,
     jobs: Annotated[int, typer.Option(min=1, help="Runs at a time.")] = 1,
     yaw: Annotated[float, typer.Option(help="Starts are turned by 0 to this, degrees.")] = 360.0,
@@ -64,6 +71,13 @@ def benchmark(
 
     An interrupted benchmark goes on where it stopped when the same command is given again.
     """
+    if calibrate:
+        from mtpcr_geo.benchmark.robustness.calibrate import calibrate as fit_probability
+
+        report = fit_probability(calibrate, out)
+        if not quiet:
+            typer.echo(report)
+        return
     if robustness:
         from mtpcr_geo.benchmark.robustness.suites import SuiteOptions
 

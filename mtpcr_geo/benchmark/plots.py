@@ -206,3 +206,28 @@ def draw_radii(rows: Sequence[Row], path: Path) -> None:
     _legend(axis)
     figure.savefig(path, dpi=150)
     plt.close(figure)
+
+
+def draw_reliability(lines: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Draw the share of right runs against the probability that was said, as PNG.
+
+    Args:
+        lines: bins with ``said``, ``right`` and ``runs``, see `robustness.calibrate.reliability`.
+        path: where to.
+
+    Raises:
+        MissingPartError: if matplotlib is not installed.
+
+    """
+    plt = _pyplot()
+    figure = plt.figure(figsize=(4.8, 4.6), layout="constrained")
+    axis = figure.subplots()
+    axis.plot([0, 100], [0, 100], color="0.6", linewidth=1)
+    said, right = ([100.0 * float(line[name]) for line in lines] for name in ("said", "right"))
+    axis.plot(said, right, marker="o", **_style(0))
+    for line, x, y in zip(lines, said, right, strict=True):
+        axis.annotate(f"{line['runs']} runs", (x, y), xytext=(6, -10), textcoords="offset points", fontsize=8)
+    axis.set(xlabel="probability said, %", ylabel="runs that are right, %", xlim=(-3, 112), ylim=(-6, 104))
+    axis.grid(alpha=0.25)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)

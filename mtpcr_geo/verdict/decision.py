@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mtpcr_geo.core.statistics import neg_log10_p
 from mtpcr_geo.core.types import Rival, Verdict, VerdictName
 from mtpcr_geo.core.wording import beside, only, percent
+from mtpcr_geo.verdict.probability import probability_of
 
 Floats = NDArray[np.float64]
 
@@ -98,10 +99,12 @@ class Limits:
     """Limits between the verdicts.
 
     Attributes:
-        neg_log10_p: significance that the held-out tie points must reach to be believed: -log10 of the
-            probability that chance makes so many agree.
+        probability: probability of being right to accept, where it is known.
+        doubtful_probability: below this the result is refused.
+        neg_log10_p: where no probability is known, significance that the held-out tie points must reach to
+            be believed: -log10 of the probability that chance makes so many agree.
         doubtful_neg_log10_p: below this the result is refused.
-        agreeing: share of the held-out tie points that must agree to accept.
+        agreeing: where no probability is known, share of the held-out tie points that must agree to accept.
         margin: least strength over the next hypothesis to accept.
         null_ratio: least strength over the best of the mirrored source to accept.
         overlap_m2: least overlap to accept, square metres; that of the evidence if None.
@@ -114,11 +117,13 @@ class Limits:
 
     """
 
+    probability: float = 0.95
+    doubtful_probability: float = 0.5
     neg_log10_p: float = 6.0
     doubtful_neg_log10_p: float = 3.0
     agreeing: float = 0.15
     margin: float = 1.3
-    null_ratio: float = 1.6
+    null_ratio: float = 1.3
     overlap_m2: float | None = None
     refined_away: float = 2.0
     ground_agreeing: float = 0.7
@@ -134,36 +139,44 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
         more: further metrics to keep beside the verdict's own.
 
     """
-    digits = neg_log10_p_of(evidence)
-    share = evidence.held_out_agreeing / max(evidence.held_out, 1)
+    metrics = metrics_of(evidence)
+    probability = metrics["probability"] = probability_of(metrics)
+    if probability is None:
+        judged = held_out_finding(evidence, limits)
+        weak = metrics["neg_log10_p"] < limits.neg_log10_p
+    else:
+        judged = probability_finding(evidence, limits, probability)
+        weak = probability < limits.probability
     findings = [
-        held_out_finding(evidence, limits),
+        judged,
         margin_finding(evidence, limits),
+        null_finding(evidence, limits),
         *refinement_findings(evidence, limits),
         ground_finding(evidence, limits),
         ground_shape_finding(evidence, limits),
-        null_finding(evidence, limits),
         overlap_finding(evidence, limits),
     ]
     refusals = [found.text for found in findings if found is not None and found.refuses]
     doubts = [found.text for found in findings if found is not None and not found.refuses]
     doubts += evidence.contradictions
-    if len(doubts) >= 2 and digits < limits.neg_log10_p and not refusals:
-        value, wanted = beside(digits, limits.neg_log10_p, 1)
-        refusals = [
-            f"{len(doubts)} checks are not met, and the held-out tie points do not make up for it "
-            f"(significance {value}, wanted {wanted})"
-        ]
+    if len(doubts) >= 2 and weak and not refusals:
+        refusals = [f"{len(doubts)} checks are not met, and the rest of the evidence does not make up for it"]
     name: VerdictName = "refused" if refusals else "doubtful" if doubts else "accepted"
-    reasons = [*refusals, *doubts] if name != "accepted" else _grounds(evidence)
+    reasons = [*refusals, *doubts] if name != "accepted" else _grounds(evidence, probability)
     rivals = tuple(rival for rival in evidence.rivals if rival.margin < limits.margin)
-    metrics: dict[str, Any] = {
+    notes = not_checked(evidence, name)
+    return Verdict(name, (*reasons, *notes), metrics | (more or {}), () if name == "accepted" else rivals)
+
+
+def metrics_of(evidence: Evidence) -> dict[str, Any]:
+    """Return the evidence by the names that it has in ``run.json``."""
+    return {
         "held_out_tie_points": evidence.held_out,
         "held_out_agreeing": evidence.held_out_agreeing,
-        "held_out_agreeing_share": share,
+        "held_out_agreeing_share": evidence.held_out_agreeing / max(evidence.held_out, 1),
         "held_out_tolerance_m": evidence.tolerance_m,
         "held_out_median_m": evidence.held_out_median_m,
-        "neg_log10_p": digits,
+        "neg_log10_p": neg_log10_p_of(evidence),
         "hypothesis_margin": evidence.margin,
         "patch_support": evidence.support,
         "null_ratio": evidence.null_ratio,
@@ -176,20 +189,15 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
         "ground_spread_m": evidence.ground_spread_m,
         "ground_relief_m": evidence.ground_relief_m,
         "refined_away_m": evidence.refined_away_m,
+        "refinement_lost": evidence.refinement_lost,
     }
-    notes = not_checked(evidence, name)
-    return Verdict(name, (*reasons, *notes), metrics | (more or {}), () if name == "accepted" else rivals)
 
 
-def _grounds(evidence: Evidence) -> list[str]:
+def _grounds(evidence: Evidence, probability: float | None) -> list[str]:
     """Return what an acceptance rests on."""
-    grounds = [_agreement(evidence)]
-    if evidence.margin is not None:
-        grounds.append(f"the next distinct pose is {evidence.margin:.1f} times weaker")
-    if evidence.null_ratio is not None:
-        grounds.append(
-            f"the mirrored source, which has no right pose, fits {evidence.null_ratio:.1f} times worse"
-        )
+    grounds = [] if probability is None else [f"the pose is right with {_chance(probability)}"]
+    grounds.append(_agreement(evidence))
+    grounds += _against_others(evidence)
     return [
         *grounds,
         f"the clouds share {evidence.overlap_m2:.0f} m2: {evidence.overlap_source:.0%} of the source, "
@@ -237,6 +245,49 @@ class CheckFinding:
 
     text: str
     refuses: bool = False
+
+
+def probability_finding(evidence: Evidence, limits: Limits, probability: float) -> CheckFinding | None:
+    """Judge the probability of being right, and say what it follows from."""
+    if probability >= limits.probability:
+        return None
+    found = [_agreement(evidence), *_against_others(evidence)]
+    value, wanted = percent(probability, limits.probability)
+    return CheckFinding(
+        f"the pose is right with a probability of {value} only (wanted {wanted}): {'; '.join(found)}; "
+        f"{_for_more_evidence(evidence)}",
+        refuses=probability < limits.doubtful_probability,
+    )
+
+
+def _against_others(evidence: Evidence) -> list[str]:
+    """Say how far the pose stands above the next distinct one and the mirrored source."""
+    found = []
+    if evidence.margin is not None:
+        found.append(f"the next distinct pose is {_times(evidence.margin, 'weaker', 'stronger')}")
+    if evidence.null_ratio is not None:
+        worse = _times(evidence.null_ratio, "worse", "better")
+        found.append(f"the mirrored source, which has no right pose, fits {worse}")
+    return found
+
+
+def _times(ratio: float, below: str, above: str) -> str:
+    """Say by how many times something lies below one, or above it."""
+    return f"{ratio:.1f} times {below}" if ratio >= 1.0 else f"{1.0 / max(ratio, 0.01):.1f} times {above}"
+
+
+def _chance(probability: float) -> str:
+    """Say a probability; what is nearly sure is said as such, since no run could show more digits."""
+    return "a probability of more than 99 %" if probability > 0.99 else f"a probability of {probability:.0%}"
+
+
+def _for_more_evidence(evidence: Evidence) -> str:
+    """Say what would tell more."""
+    if evidence.missing is not None:
+        return evidence.missing
+    if max(evidence.overlap_source, evidence.overlap_target) < LITTLE_SHARED:
+        return _for_more_tie_points(evidence)
+    return _OTHER_PLACES
 
 
 def held_out_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:

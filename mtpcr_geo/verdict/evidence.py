@@ -18,13 +18,12 @@ from mtpcr_geo.method.scales import MAX_LEAST_OVERLAP_M2, ground_cell_for, scale
 from mtpcr_geo.method.shortcomings import what_is_missing
 from mtpcr_geo.method.solve import solve_tie_points
 from mtpcr_geo.verdict.decision import Evidence
+from mtpcr_geo.verdict.probability import TIE_POINTS_PER_PATCH
 
 GROUND_AGREES_M = 0.5
 UNBOUNDED_CELLS = 2.0
 FAR_TOLERANCES, FAR_TURN_DEG = 5.0, 5.0
 """Tolerances in plan, or turn, from which on another pose is another place and not the same a little off."""
-TIE_POINTS_PER_PATCH = 4
-"""Patches overlap by half, so about four tie points tell what one independent tie would."""
 
 
 def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[str, Any]]:

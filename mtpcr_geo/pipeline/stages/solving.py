@@ -235,20 +235,30 @@ class AssessOptions(StageOptions):
         "or two "
         "for keypoint matchers",
     )
+    probability: float = Field(
+        0.95,
+        ge=0,
+        le=1,
+        description="probability of being within 5 degrees and 2 m of the truth wanted to accept",
+    )
     neg_log10_p: float = Field(
         6.0,
         ge=0,
-        description="significance of the held-out tie points' agreement wanted to accept: minus log10 of the "
-        "probability that chance makes as many agree",
+        description="where no probability is known, as of keypoint matchers: significance of the held-out "
+        "tie points' agreement wanted to accept, minus log10 of the probability that chance makes as many "
+        "agree",
     )
     margin: float = Field(
         1.3, ge=1, description="strength over the next distinct hypothesis wanted to accept"
     )
     agreeing: float = Field(
-        0.15, ge=0, le=1, description="share of held-out tie points that must agree to accept"
+        0.15,
+        ge=0,
+        le=1,
+        description="where no probability is known: share of held-out tie points that must agree to accept",
     )
     null_ratio: float = Field(
-        1.6, ge=0, description="strength over the best of the mirrored source wanted to accept"
+        1.3, ge=0, description="strength over the best of the mirrored source wanted to accept"
     )
     min_overlap: float | None = Field(
         None,
@@ -279,6 +289,7 @@ class Assess(Stage):
         distances, contradictions = departure(pair)
         evidence, more = replace(evidence, contradictions=contradictions), more | distances
         limits = Limits(
+            probability=options.probability,
             neg_log10_p=options.neg_log10_p,
             agreeing=options.agreeing,
             margin=options.margin,

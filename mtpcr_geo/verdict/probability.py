@@ -1,0 +1,116 @@
+"""How probable it is that a pose is right: a logistic model of the evidence, fitted to runs of known answer.
+
+Each piece of evidence may only speak for a pose: weights are not negative. What the model was fitted to, and
+how it does on sites that it was not fitted to, stands in ``calibration.json`` beside this module;
+``mtpcr-geo benchmark --calibrate`` makes it from the rows of robustness benchmarks.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from mtpcr_geo.core.arrays import Floats
+
+FILE = "calibration.json"
+RATIOS = (0.2, 20.0)
+"""Ratios of strengths beyond which they say no more."""
+GROUND_NOISE_M = 0.05
+"""Added to spread and relief of the ground: what is below it is noise."""
+GROUND_CLEAR = (-1.0, 2.5)
+GROUND_CELLS, GROUND_EXPECTED = 30, 0.7
+TIE_POINTS_PER_PATCH = 4
+"""Patches overlap by half, so about four tie points tell what one independent tie would."""
+
+FEATURES = ("margin", "null", "agreement", "ground_shape", "ground_agreement", "refinement")
+"""The evidence, as numbers that grow with what speaks for a pose:
+
+- margin: logarithm of the strength over that of the next distinct pose;
+- null: logarithm of the strength over the best of the mirrored source;
+- agreement: logarithm of the significance of the held-out tie points, overlapping ones counted once;
+- ground_shape: logarithm of the ground's relief over the spread of the height differences;
+- ground_agreement: share of the common ground that agrees, over what flat ground of any place reaches;
+- refinement: -1 where surfaces fit better where the tie points do not agree.
+"""
+
+
+def features_of(metrics: Mapping[str, Any]) -> Floats | None:
+    """Return the evidence of a verdict's metrics as numbers.
+
+    Args:
+        metrics: as `mtpcr_geo.verdict.decision.assess` gives them.
+
+    Returns:
+        (f,) in the order of `FEATURES`; None where the matcher gives no margin, or no mirrored source was
+        searched.
+
+    """
+    margin, null = metrics.get("hypothesis_margin"), metrics.get("null_ratio")
+    significance = metrics.get("neg_log10_p")
+    if margin is None or null is None or significance is None:
+        return None
+    spread, relief = metrics.get("ground_spread_m"), metrics.get("ground_relief_m")
+    shape = 0.0
+    if spread is not None and relief is not None:
+        shape = float(np.clip(np.log((relief + GROUND_NOISE_M) / (spread + GROUND_NOISE_M)), *GROUND_CLEAR))
+    cells = metrics.get("ground_cells") or 0
+    share = (metrics.get("ground_agreeing") or 0) / max(cells, 1) - GROUND_EXPECTED
+    return np.array(
+        [
+            np.log(np.clip(margin, *RATIOS)),
+            np.log(np.clip(null, *RATIOS)),
+            np.log1p(significance / TIE_POINTS_PER_PATCH),
+            shape,
+            share if cells >= GROUND_CELLS else 0.0,
+            -1.0 if metrics.get("refinement_lost") else 0.0,
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A fitted model.
+
+    Attributes:
+        intercept: log odds of a pose of which nothing is known.
+        weights: (f,) by which the features of `FEATURES` add to the log odds.
+        about: what it was fitted to, when, and how it does on other sites.
+
+    """
+
+    intercept: float
+    weights: tuple[float, ...]
+    about: Mapping[str, Any]
+
+    def probability(self, features: Floats) -> Floats:
+        """Return the probability of being right, (...,), of (..., f) features."""
+        odds = self.intercept + np.asarray(features) @ np.array(self.weights)
+        return np.asarray(1.0 / (1.0 + np.exp(-odds)))
+
+
+@cache
+def shipped() -> Calibration:
+    """Return the calibration that comes with the package."""
+    data = json.loads((resources.files(__package__) / FILE).read_text(encoding="utf-8"))
+    weights = tuple(float(data["weights"][name]) for name in FEATURES)
+    return Calibration(float(data["intercept"]), weights, data["about"])
+
+
+def probability_of(metrics: Mapping[str, Any]) -> float | None:
+    """Return how probable it is that a pose is within 5 degrees and 2 m of the truth.
+
+    Args:
+        metrics: see `features_of`.
+
+    Returns:
+        0 to 1; None where the evidence is not of the kind that the model knows.
+
+    """
+    features = features_of(metrics)
+    return None if features is None else float(shipped().probability(features))
