@@ -13,6 +13,7 @@ from mtpcr_geo.core.errors import MissingPartError, OptionError
 from mtpcr_geo.pipeline import safety
 from mtpcr_geo.pipeline.grammar import StageSpec, file_of
 from mtpcr_geo.pipeline.pdal import bindings
+from mtpcr_geo.pipeline.pdal.switches import Access
 from mtpcr_geo.pipeline.registry import make_options, stage_types, unknown_type
 from mtpcr_geo.pipeline.stage import Node, Stage
 from mtpcr_geo.pipeline.stages.memory import MemoryReader
@@ -41,7 +42,8 @@ def plan(
 
     """
     given = given or {}
-    safety.check(specs, allow_code=allow_code, allow_network=allow_network)
+    access = Access(code=allow_code, network=allow_network)
+    safety.check([spec for spec in specs if spec.tag not in given], access)
     by_pdal = served_by_pdal([spec for spec in specs if spec.tag not in given])
     stages: dict[str, Stage] = {}
     for spec in specs:
@@ -50,7 +52,7 @@ def plan(
         elif spec.tag in by_pdal:
             from mtpcr_geo.pipeline.pdal.stages import make_pdal_stage
 
-            stages[spec.tag] = make_pdal_stage(spec)
+            stages[spec.tag] = make_pdal_stage(spec, access)
         else:
             kind = stage_types()[spec.type]
             stages[spec.tag] = kind(make_options(spec.label, kind.Options, spec.options), spec.tag)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core.errors import MissingPartError
+from mtpcr_geo.pipeline.pdal.switches import Access, held_to, keep_plugins_home
 
 INSTALL = (
     "install PDAL and its Python package: conda install -c conda-forge python-pdal (all systems), "
@@ -78,12 +79,13 @@ def drivers() -> dict[str, Driver]:
 
 
 def load() -> Any:
-    """Import the `pdal` package.
+    """Import the `pdal` package; it loads PDAL's plugins, but none from the current folder.
 
     Raises:
         MissingPartError: saying how to install it.
 
     """
+    keep_plugins_home()
     try:
         import pdal
     except ImportError as error:
@@ -113,13 +115,19 @@ def arrays_of(iterator: Any) -> Iterator[NDArray[np.void]]:
         time.sleep(max(0.0, earliest - time.monotonic()))
 
 
-def problem_of(stages: Sequence[Mapping[str, Any]]) -> str | None:
+def problem_of(stages: Sequence[Mapping[str, Any]], access: Access) -> str | None:
     """Let PDAL prepare stages without running them, and return its first complaint, or None.
 
     Preparing reads the options and the headers of inputs; no point is read and no file is written.
+
+    Args:
+        stages: as PDAL's JSON has them.
+        access: what the stages may do meanwhile.
+
     """
     try:
-        pipeline([*stages, _STOP]).execute()
+        with held_to(access):
+            pipeline([*stages, _STOP]).execute()
     except _ERRORS as error:
         message = first_line(error)
         return None if _STOP_DIMENSION in message else message

@@ -26,6 +26,7 @@ from mtpcr_geo.pipeline.pdal.step import (
     numbered_files,
     stage_json,
 )
+from mtpcr_geo.pipeline.pdal.switches import Access, held_to
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -181,9 +182,10 @@ class PdalCloud(Cloud):
 
 @contextmanager
 def _blamed(steps: Sequence[Step]) -> Iterator[None]:
-    """Turn PDAL's exceptions into errors that name the stage."""
+    """Keep PDAL to what the steps may do, and turn its exceptions into errors that name the stage."""
     try:
-        yield
+        with held_to(steps[-1].access if steps else Access()):
+            yield
     except (RuntimeError, ValueError, TypeError) as error:
         message = bindings.first_line(error)
         named = [step for step in steps if message.startswith(f"{step.spec.type}:")]

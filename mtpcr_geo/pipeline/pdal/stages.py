@@ -15,6 +15,7 @@ from mtpcr_geo.pipeline.grammar import StageSpec, file_of
 from mtpcr_geo.pipeline.pdal import bindings
 from mtpcr_geo.pipeline.pdal.cloud import PdalCloud
 from mtpcr_geo.pipeline.pdal.step import Step, failure, file_written, is_reader, stage_json
+from mtpcr_geo.pipeline.pdal.switches import Access
 from mtpcr_geo.pipeline.stage import RunContext, Stage, StageOptions, Value
 
 _NO_POINTS = {"type": "readers.faux", "count": 1, "mode": "constant", "bounds": "([0, 1], [0, 1], [0, 1])"}
@@ -40,9 +41,10 @@ class PdalStage(Stage):
     type = "pdal"
     Options = PdalOptions
 
-    def __init__(self, options: StageOptions, spec: StageSpec) -> None:
+    def __init__(self, options: StageOptions, spec: StageSpec, access: Access) -> None:
         super().__init__(options, spec.tag)
         self.spec = spec
+        self.access = access
         self.boundary = True
         self.for_us = False
         self.upstream: Sequence[Stage] = ()
@@ -62,7 +64,7 @@ class PdalStage(Stage):
         """Let PDAL prepare everything up to this stage, without running it."""
         chain: dict[str, dict[str, Any]] = {}
         guessed = self._prepared(chain)
-        problem = bindings.problem_of(list(chain.values()))
+        problem = bindings.problem_of(list(chain.values()), self.access)
         # without the true cloud, PDAL cannot know which dimensions there will be
         if problem and not (guessed and "dimension" in problem.lower()):
             raise failure(self.spec, problem, preparing=True)
@@ -79,7 +81,7 @@ class PdalStage(Stage):
 
     def _step(self, inputs: Sequence[Cloud]) -> Step:
         before = tuple(given.step if isinstance(given, PdalCloud) else given for given in inputs)
-        return Step(self.spec, before, self.metadata)
+        return Step(self.spec, before, self.metadata, access=self.access)
 
     def _prepared(self, chain: dict[str, dict[str, Any]]) -> bool:
         """Add this stage and all before it to a chain for PDAL; say whether a cloud had to be guessed."""
@@ -99,8 +101,12 @@ class PdalStage(Stage):
         return guessed
 
 
-def make_pdal_stage(spec: StageSpec) -> PdalStage:
+def make_pdal_stage(spec: StageSpec, access: Access) -> PdalStage:
     """Make a stage that PDAL serves.
+
+    Args:
+        spec: the stage as written.
+        access: what it may do.
 
     Raises:
         OptionError: if this PDAL does not know the stage, or an option of it.
@@ -116,5 +122,5 @@ def make_pdal_stage(spec: StageSpec) -> PdalStage:
     options: Mapping[str, Any] = {key: value for key, value in spec.options.items() if key != "user_data"}
     # every PDAL stage has a class of its own, so that its type is a class attribute as everywhere
     kind = type("PdalStage", (PdalStage,), {"type": spec.type, "__doc__": drivers[spec.type].description})
-    stage: PdalStage = kind(PdalOptions.model_validate(options), spec)
+    stage: PdalStage = kind(PdalOptions.model_validate(options), spec, access)
     return stage

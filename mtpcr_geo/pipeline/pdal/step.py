@@ -11,6 +11,7 @@ from typing import Any
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError, OutputError
 from mtpcr_geo.pipeline.grammar import StageSpec, file_of
+from mtpcr_geo.pipeline.pdal.switches import Access
 
 # the name under which a file is written until the run is whole
 _PASSING = re.compile(r"\.([^/\\]+)\.part-\d+(\.\w+)")
@@ -25,6 +26,7 @@ class Step:
         inputs: what it takes from.
         metadata: where PDAL's metadata of it goes, for the audit.
         written: whether it is a writer that has written its file.
+        access: what it may do.
 
     """
 
@@ -32,6 +34,7 @@ class Step:
     inputs: tuple[Step | Cloud, ...]
     metadata: dict[str, Any] = field(default_factory=dict)
     written: bool = False
+    access: Access = field(default_factory=Access)
 
     @property
     def tag(self) -> str:

@@ -1,0 +1,220 @@
+"""A pipeline of someone else: no code of its own, and nothing beyond this machine, while validated too."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socketserver
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import mtpcr_geo
+from mtpcr_geo.cli.app import app
+from mtpcr_geo.core.errors import MtpcrError, OptionError, OutputError
+from mtpcr_geo.pipeline.grammar import link, parse
+from mtpcr_geo.pipeline.pdal import bindings
+from mtpcr_geo.pipeline.pdal.allowed import ALLOWED
+from mtpcr_geo.pipeline.pdal.switches import Access, held_to
+from mtpcr_geo.pipeline.safety import check
+
+READER = {"type": "readers.las", "filename": "target.laz"}
+
+
+CLOSED = Access()
+
+
+def refuse(*stages, access=CLOSED):
+    check(link(parse(json.dumps([READER, *stages]))), access)
+
+
+@pytest.mark.parametrize(
+    "kind", ["filters.info", "writers.text", "writers.gdal", "filters.range", "writers.null"]
+)
+def test_no_stage_takes_a_library(kind):
+    with pytest.raises(OptionError, match=r"no option 'plugin'.*say --allow-code"):
+        refuse({"type": kind, "filename": "x.txt", "plugin": "evil.so"} if "writers" in kind else
+               {"type": kind, "plugin": "evil.so"})  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["filters.python", "filters.shell", "filters.julia", "filters.of_tomorrow"])
+def test_stages_that_run_code_or_that_nobody_knows_are_refused(kind):
+    with pytest.raises(OptionError, match="say --allow-code"):
+        refuse({"type": kind})
+    refuse({"type": kind, "anything": 1}, access=Access(code=True))
+
+
+def test_every_option_that_pdal_lists_is_allowed_or_left_out_on_purpose(pdal):
+    left_out = {
+        "log", "option_file",
+        # written beside the set of outputs
+        "density", "dir", "bundledfile",
+    }  # fmt: skip
+    code = {"filters.shell", "filters.python", "readers.numpy"}
+    refused = {"writers.ept_addon", "filters.streamcallback", "readers.memoryview"}
+    for name, driver in bindings.drivers().items():
+        if name in code | refused:
+            assert name not in ALLOWED
+        else:
+            assert set(driver.options) - left_out <= ALLOWED[name], name
+
+
+REMOTE = {
+    "readers.ept, ogr in a string": {
+        "type": "readers.ept", "filename": "ept.json",
+        "ogr": json.dumps({"drivers": ["GeoJSON"], "datasource": "http://127.0.0.1:9/a.json"}),
+    },
+    "escaped slashes": {"type": "readers.ept", "filename": "e", "ogr": '{"datasource": "http:\\/\\/x/a"}'},
+    "addons": {"type": "readers.ept", "filename": "e", "addons": {"Z": "https://x/addon"}},
+    "addons as keys": {"type": "readers.ept", "filename": "e", "addons": '{"https://x/addon": "Z"}'},
+    "JSON in JSON": {"type": "readers.ept", "filename": "e", "ogr": json.dumps(json.dumps({"a": "s3://b"}))},
+    "connection": {"type": "filters.overlay", "datasource": "PG:host=x", "dimension": "Z"},
+    "inline XML": {"type": "filters.dem", "raster": "<GDAL_WMS></GDAL_WMS>"},
+    "query": {"type": "filters.overlay", "datasource": "a.gpkg", "query": "select * from 'PG:host=x'.t"},
+    "CRS by address": {"type": "filters.reprojection", "out_srs": "http://x/4326"},
+    "virtual": {"type": "filters.colorization", "raster": "/vsicurl/http:x"},
+    "grid by address": {"type": "filters.projpipeline", "coord_op": "+proj=vgridshift +grids=https://x/g.tif"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REMOTE)
+def test_remote_names_are_found_wherever_they_stand(name):
+    with pytest.raises(OptionError, match=r"remote or virtual.*say --allow-network"):
+        refuse(REMOTE[name])
+    refuse(REMOTE[name], access=Access(network=True))
+
+
+WMS = "<GDAL_WMS><Service name='TMS'><ServerUrl>{url}/x</ServerUrl></Service></GDAL_WMS>"
+VRT = (
+    "<VRTDataset rasterXSize='1' rasterYSize='1'><VRTRasterBand dataType='Byte' band='1'><SimpleSource>"
+    "<SourceFilename relativeToVRT='1'>{url}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
+)
+
+
+@pytest.mark.parametrize("kind", ["filters.colorization", "filters.dem", "filters.hag_dem", "readers.gdal"])
+@pytest.mark.parametrize("file", ["a.vrt", "b.vrt", "wms.xml", "dem.tif"])
+def test_files_that_name_remote_ones_are_looked_into(kind, file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("a.vrt").write_text(VRT.format(url="/vsicurl/http://127.0.0.1/a.tif"))
+    Path("b.vrt").write_text(VRT.format(url="sub/c.dat"))
+    Path("sub").mkdir()
+    Path("sub/c.dat").write_text(VRT.format(url="../wms.xml"))
+    for name in ("wms.xml", "dem.tif"):
+        Path(name).write_text("\ufeff  " + WMS.format(url="http://127.0.0.1"), encoding="utf-8")
+    option = "filename" if kind == "readers.gdal" else "raster"
+    with pytest.raises(OptionError, match="which names something remote or virtual"):
+        refuse({"type": kind, option: file})
+
+
+def test_a_local_vrt_is_no_matter_nor_one_that_names_itself(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("a.vrt").write_text(VRT.format(url="b.vrt"))
+    Path("b.vrt").write_text(VRT.format(url="a.vrt"))
+    refuse({"type": "filters.dem", "raster": "a.vrt"})
+
+
+def test_writers_of_several_files_are_refused():
+    for stage, words in (
+        ({"type": "writers.ogr", "filename": "a.shp"}, "shapefile"),
+        ({"type": "writers.ogr", "filename": "a", "ogrdriver": "ESRI Shapefile"}, "several files"),
+        ({"type": "writers.gdal", "filename": "a.img", "gdaldriver": "ENVI"}, "several files"),
+    ):
+        with pytest.raises(OutputError, match=words):
+            refuse(stage, access=Access(code=True, network=True))
+    with pytest.raises(OptionError, match="is not run"):
+        refuse({"type": "writers.ept_addon", "addons": {}}, access=Access(code=True))
+
+
+def test_the_switches_are_put_back(monkeypatch):
+    monkeypatch.setenv("http_proxy", "http://mine")
+    monkeypatch.delenv("GDAL_VRT_ENABLE_PYTHON", raising=False)
+    with held_to(Access()), held_to(Access(network=True)):
+        assert os.environ["http_proxy"] != "http://mine"
+        assert os.environ["GDAL_VRT_ENABLE_PYTHON"] == "NO"
+    assert os.environ["http_proxy"] == "http://mine"
+    assert "GDAL_VRT_ENABLE_PYTHON" not in os.environ
+
+
+class Listening(socketserver.BaseRequestHandler):
+    """Note that somebody came, and hang up."""
+
+    def handle(self) -> None:
+        self.server.came.append(self.client_address)  # type: ignore[attr-defined]
+
+
+@pytest.fixture
+def hears():
+    """A server on this machine, and the list of those who have come."""
+    with socketserver.TCPServer(("127.0.0.1", 0), Listening) as server:
+        server.came = []  # type: ignore[attr-defined]
+        thread = threading.Thread(target=server.serve_forever, args=(0.05,))
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_address[1]}", server.came  # type: ignore[attr-defined]
+        server.shutdown()
+        thread.join()
+
+
+@pytest.mark.parametrize("arguments", [["--validate"], []])
+def test_a_server_hears_nothing_even_of_what_the_text_does_not_show(
+    arguments, hears, pdal, town_files, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    url, came = hears
+    shutil.copy(town_files[1], "target.laz")
+    monkeypatch.setattr("mtpcr_geo.pipeline.reach._named_by", lambda path, seen: None)
+    Path("a.vrt").write_text(VRT.format(url=f"/vsicurl/{url}/a.tif"))
+    Path("wms.xml").write_text(WMS.format(url=url + "/${z}/${x}/${y}"))
+    for file in ("a.vrt", "wms.xml"):
+        for kind in ("dem", "hag_dem", "colorization"):
+            stage = {"type": f"filters.{kind}", "raster": file}
+            stage |= {"limits": "Z[0:1]"} if kind == "dem" else {}
+            Path("p.json").write_text(json.dumps([READER, stage]))
+            result = CliRunner().invoke(app, ["pipeline", "p.json", *arguments])
+            assert result.exception is None or isinstance(result.exception, SystemExit)
+            assert came == [], (file, kind)
+
+
+@pytest.mark.parametrize(("code", "network"), [(False, True), (False, False)])
+def test_the_server_is_asked_only_where_the_network_is_allowed(
+    code, network, hears, pdal, town_files, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("mtpcr_geo.pipeline.reach.check", lambda spec: None)
+    url, came = hears
+    Path("a.vrt").write_text(VRT.format(url=f"/vsicurl/{url}/a.tif"))
+    colour = {"type": "filters.colorization", "raster": "a.vrt"}
+    pipeline = mtpcr_geo.Pipeline([str(town_files[1]), colour], allow_code=code, allow_network=network)
+    with pytest.raises(MtpcrError, match="PDAL says"):
+        pipeline.execute()
+    assert bool(came) == network
+
+
+@pytest.mark.skipif(shutil.which("cc") is None or not sys.platform.startswith("linux"), reason="needs cc")
+@pytest.mark.parametrize("arguments", [["--validate"], []])
+def test_no_library_beside_a_pipeline_runs(arguments, pdal, town_files, tmp_path):
+    """Neither one that the pipeline names, nor one that lies in the current folder."""
+    (tmp_path / "evil.c").write_text(
+        "#include <stdio.h>\n__attribute__((constructor)) static void ran(void)"
+        '{ FILE *file = fopen("ran", "w"); if (file) fclose(file); }\n'
+    )
+    library = tmp_path / "libpdal_plugin_filter_evil.so"
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", library, tmp_path / "evil.c"], check=True)
+    shutil.copy(town_files[1], tmp_path / "target.laz")
+    environment = {key: value for key, value in os.environ.items() if key != "PDAL_DRIVER_PATH"}
+    for stage in (
+        {"type": "filters.info", "plugin": str(library)},
+        {"type": "filters.evil"},
+        {"type": "filters.range", "limits": "Z[0:1000]"},
+    ):
+        (tmp_path / "p.json").write_text(json.dumps([READER, stage]))
+        command = [sys.executable, "-m", "mtpcr_geo", "pipeline", "p.json", *arguments]
+        done = subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == (0 if stage["type"] == "filters.range" else 2), done.stderr
+        assert not (tmp_path / "ran").exists(), stage
