@@ -289,7 +289,9 @@ def register(
     if out is not None:
         writers = writers_of(Path(out), force=chosen.force, recorded=chosen.recording)
         nodes += chained(writers, (nodes[-1].tag,))
-        return Registration(run(nodes, overwrite=chosen.overwrite, progress=progress), force=chosen.force)
+        recording = Path(out) / OUTPUT_NAMES["recording"]
+        result = run(nodes, overwrite=chosen.overwrite, progress=progress, replaces=[recording])
+        return Registration(result, force=chosen.force)
     if not chosen.recording:
         return Registration(run(nodes, progress=progress), force=chosen.force)
     # kept in a temporary folder until it is saved; deleted together with the registration
@@ -343,7 +345,8 @@ def apply(
     if out is None:
         return move(chain, points, inverse=inverse)
     moved = moved_by(chain, cloud_of(points, "points"), inverse=inverse)
-    write_moved(Path(out), moved, overwrite=overwrite, progress=progress)
+    reads = [Path(one) for one in (transform, points) if isinstance(one, str | os.PathLike)]
+    write_moved(Path(out), moved, overwrite=overwrite, reads=reads, progress=progress)
     return Path(out)
 
 

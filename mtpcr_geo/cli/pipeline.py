@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
@@ -78,6 +79,8 @@ def run_pipeline(options: PipelineVerb, progress: Progress) -> RunResult | None:
         validate(specs, settings)
         return None
     with OutputSet(options.overwrite) as outputs:
+        read = [grammar.file_of(spec.options) for spec in specs if spec.type.startswith("readers.")]
+        outputs.keep(Path(name) for name in (file, *read) if name)
         part = outputs.path(options.metadata) if options.metadata else None
         result = execute(specs, settings, progress)
         if part is not None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mtpcr_geo.core.errors import CrsError, InputError
+import numpy as np
+
+from mtpcr_geo.core.errors import CrsError, InputError, OutputError
 from mtpcr_geo.crs.facts import same_place
 from mtpcr_geo.export.transform import read_transform
 from mtpcr_geo.io.las import open_cloud
@@ -20,6 +23,10 @@ if TYPE_CHECKING:
     from mtpcr_geo.core.progress import Progress
     from mtpcr_geo.crs.chain import TransformChain
     from mtpcr_geo.io.memory import CloudLike
+
+_ENDINGS = (".las", ".laz")
+# a cloud that states no CRS may lie this many extents of the registered one away from it
+_FAR = 10.0
 
 
 def apply_transform(
@@ -54,8 +61,9 @@ def apply_transform(
     chain = read_transform(transform_path)
     cloud = open_cloud(in_path)
     out_path = Path(out_path)
-    if out_path.exists() and out_path.samefile(in_path):
-        raise InputError(f"{out_path} is input and output at once; write to another file")
+    for read in (Path(in_path), Path(transform_path)):
+        if out_path.exists() and out_path.samefile(read):
+            raise InputError(f"{out_path} is input and output at once; write to another file")
     write_moved(out_path, moved_by(chain, cloud, inverse=inverse), overwrite=overwrite, progress=progress)
     return out_path
 
@@ -92,7 +100,8 @@ def moved_by(chain: TransformChain, cloud: Cloud, *, inverse: bool = False) -> M
         inverse: go from target to source.
 
     Raises:
-        CrsError: if the cloud is not in the frame from which the transform starts.
+        CrsError: if the cloud is not in the frame from which the transform starts, or states no CRS and lies
+            far from where that of the registration lay.
 
     """
     start, end = (chain.target, chain.source) if inverse else (chain.source, chain.target)
@@ -102,19 +111,69 @@ def moved_by(chain: TransformChain, cloud: Cloud, *, inverse: bool = False) -> M
             f"{cloud.name} is in {cloud.crs.name}, and the transform starts from its {side}'s "
             f"{start.file_crs.name}; reproject the cloud first, or check whether --inverse is meant"
         )
+    _check_near(chain, cloud, inverse)
     return Moved(cloud, chain.inverse if inverse else chain.forward, end.file_crs)
 
 
+def _check_near(chain: TransformChain, cloud: Cloud, inverse: bool) -> None:
+    """Refuse a cloud that states no CRS and lies where the cloud that was registered was not.
+
+    Raises:
+        CrsError: if it is farther away than many times the extent of that one.
+
+    """
+    if cloud.crs is not None or not cloud.count:
+        return
+    box = chain.bounds
+    if inverse:
+        corners = np.array(
+            [[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+        )
+        moved = chain.forward(corners)
+        box = np.array([moved.min(axis=0), moved.max(axis=0)])
+    # in the plane: heights of one place differ by their datum
+    low, high = cloud.minimum[:2], cloud.maximum[:2]
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return
+    gap = float(np.hypot(*np.maximum(np.maximum(box[0, :2] - high, low - box[1, :2]), 0.0)))
+    extent = float(np.hypot(*(box[1, :2] - box[0, :2])))
+    if gap > _FAR * max(extent, np.finfo(float).tiny):
+        side = "target" if inverse else "source"
+        raise CrsError(
+            f"{cloud.name} states no CRS and lies {gap / extent if extent else gap:.3g} times the extent of "
+            f"the {side} away from it, so it is hardly in its frame; state its CRS in the file, or check "
+            "whether --inverse is meant"
+        )
+
+
 def write_moved(
-    out_path: str | Path, moved: Moved, *, overwrite: bool = False, progress: Progress | None = None
+    out_path: Path,
+    moved: Moved,
+    *,
+    overwrite: bool = False,
+    reads: Iterable[str | Path] = (),
+    progress: Progress | None = None,
 ) -> None:
     """Stream a moved cloud into a new LAS, LAZ or COPC file, with digits fine enough to move it back.
 
+    Args:
+        out_path: where to write; the suffix is the format.
+        moved: what to write.
+        overwrite: whether `out_path` may be replaced.
+        reads: files that are read, and never replaced.
+        progress: where to report the points written.
+
     Raises:
-        OutputError: if the output cannot be written, or exists.
+        OutputError: if the output cannot be written, or exists, or its ending names no format.
 
     """
+    if out_path.suffix.lower() not in _ENDINGS:
+        raise OutputError(
+            f"{out_path} ends in none of {', '.join(_ENDINGS)} and .copc.laz, which are the formats written; "
+            "name such a file"
+        )
     with OutputSet(overwrite) as outputs:
+        outputs.keep(Path(file) for file in reads)
         write_cloud(
             outputs.path(out_path),
             moved.base,

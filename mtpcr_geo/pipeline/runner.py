@@ -134,6 +134,7 @@ def run(
     overwrite: bool = False,
     progress: Progress | None = None,
     before: RunResult | None = None,
+    replaces: Sequence[Path] = (),
 ) -> RunResult:
     """Run stages in their order; their files come into place together at the end, or not at all.
 
@@ -142,6 +143,7 @@ def run(
         overwrite: replace files that are already there.
         progress: where long work reports.
         before: a run that these stages carry on; they may take from its stages.
+        replaces: further files of an earlier run, removed where these stages do not write them.
 
     Returns:
         What was made. A registration that fails is refused, and no error.
@@ -168,6 +170,7 @@ def run(
                     versions=versions(),
                     inputs=tuple(file.hashed() for file in context.facts.inputs),
                 )
+            outputs.keep(file.path for file in context.facts.inputs)
             for stage in stages:
                 stage.open(context)
             context.recorder.begin(context.facts.audit())
@@ -177,6 +180,8 @@ def run(
                 values[node.tag] = _turn(node.stage, [values[tag] for tag in inputs[node.tag]], context)
         # a run that fails and keeps no evidence leaves nothing
         keep = context.failure is None or any(stage.evidence for stage in stages)
+        # what an earlier run left under these names never stands beside this one's verdict
+        outputs.replace([*(path for stage in stages for path in stage.writes()), *replaces])
         written = outputs.commit() if keep else []
     seconds = time.perf_counter() - context.facts.started
     return RunResult(values, tuple(context.done), written, context.failure, context.facts, seconds)

@@ -16,7 +16,7 @@ from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import CrsError, InputError, OutputError
 from mtpcr_geo.core.types import Pair, Side
 from mtpcr_geo.crs import TransformChain, resolve_frames
-from mtpcr_geo.export.apply import apply_transform
+from mtpcr_geo.export.apply import apply_transform, moved_by
 from mtpcr_geo.export.descriptions import shift_text
 from mtpcr_geo.export.transform import (
     dumps,
@@ -305,6 +305,37 @@ def test_apply_refuses_what_it_must(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         *("cut.laz", "feet.laz", "source.laz", "t.json", "there.laz")
     ]
+
+
+def test_apply_writes_no_other_format_and_never_over_its_own_transform(tmp_path):
+    pair = a_pair(source_path=tmp_path / "source.laz")
+    write_transform_json(tmp_path / "t.json", pair)
+    before = (tmp_path / "t.json").read_bytes()
+    (tmp_path / "link.laz").hardlink_to(tmp_path / "t.json")
+    for name, words in (
+        ("t.json", "input and output"),
+        ("link.laz", "input and output"),
+        ("out.xyz", "ends in"),
+    ):
+        with pytest.raises((InputError, OutputError), match=words):
+            apply_transform(tmp_path / "t.json", tmp_path / "source.laz", tmp_path / name, overwrite=True)
+    assert (tmp_path / "t.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_apply_refuses_a_cloud_without_crs_that_lies_far_away(tmp_path, inverse):
+    pair = a_pair(source_path=tmp_path / "source.laz")
+    write_transform_json(tmp_path / "t.json", pair)
+    chain = read_transform(tmp_path / "t.json")
+    near = chain.bounds if not inverse else chain.forward(chain.bounds)
+    diagonal = np.linalg.norm(np.ptp(chain.bounds, axis=0)[:2])
+    for away, refused in ((1.0, False), (5.0, False), (30.0, True), (5e6, True)):
+        cloud = ArrayCloud(near + [away * diagonal, 0, 0], None)
+        if refused:
+            with pytest.raises(CrsError, match="states no CRS and lies"):
+                moved_by(chain, cloud, inverse=inverse)
+        else:
+            assert moved_by(chain, cloud, inverse=inverse).count == 2
 
 
 @pytest.mark.parametrize(
