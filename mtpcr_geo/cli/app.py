@@ -7,20 +7,24 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import os
 import signal
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 import mtpcr_geo
-from mtpcr_geo.core.errors import EXIT_INTERRUPTED, MtpcrError, OptionError, one_line
+from mtpcr_geo.core.errors import EXIT_DEFECT, EXIT_INTERRUPTED, MtpcrError, OptionError, one_line
 from mtpcr_geo.core.suggestions import meant
 
 NAME = "mtpcr-geo"
+TRACEBACK = "MTPCR_GEO_TRACEBACK"
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,8 @@ VERBS = {
 }
 # typer offers this exception alone, whose base is every fault of a command line
 _UsageError: type[Exception] = typer.BadParameter.__bases__[0]
+# what typer itself raises to end a command, or for a command line, passes
+_FROM_TYPER: tuple[type[BaseException], ...] = (typer.Exit, typer.Abort, *_UsageError.__mro__[:2])
 _CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 
@@ -169,7 +175,11 @@ def load(name: str) -> Any:
 
 @contextmanager
 def _errors_in_one_line() -> Iterator[None]:
-    """Turn whatever a user can cause into one line on standard error and an exit code."""
+    """Turn whatever a user can cause into one line on standard error and an exit code.
+
+    Behind it stands a wall: what nobody foresaw is a defect and said to be one. The outputs are not kept, as
+    with any other error.
+    """
     try:
         yield
     except MtpcrError as error:
@@ -178,6 +188,29 @@ def _errors_in_one_line() -> Iterator[None]:
     except KeyboardInterrupt:
         typer.echo(f"{NAME}: interrupted; no half-written file is left", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
+    except _FROM_TYPER:
+        raise
+    except BrokenPipeError:
+        raise
+    except Exception as error:
+        # the wall behind all others
+        if os.environ.get(TRACEBACK):
+            raise
+        typer.echo(f"{NAME}: {one_line(_defect(error))}", err=True)
+        raise typer.Exit(EXIT_DEFECT) from None
+
+
+def _defect(error: Exception) -> str:
+    """Say that an error is a defect of the program, where it came from, and what to do."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if "mtpcr_geo" in Path(frame.filename).parts]
+    place = f" in {Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
+    detail = f": {error}"[:200] if str(error) else ""
+    return (
+        f"this is a defect of {NAME} {mtpcr_geo.__version__}, and nothing was kept: "
+        f"{type(error).__name__}{place}{detail}; please report it with what gave it "
+        f"(with {TRACEBACK}=1 set, the same command prints where it comes from)"
+    )
 
 
 def _option_error(error: Any, what: str, valid: list[str]) -> OptionError:

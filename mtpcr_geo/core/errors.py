@@ -7,7 +7,6 @@ exits with the class's code:
 code  meaning
 ====  ==============================================================
 0     done; for ``register``: accepted
-1     a fault in the program itself (please report it)
 2     the command line, a pipeline or an option is wrong
 3     registered, but the verdict is *doubtful*
 4     the verdict is *refused*; evidence is written, no registered cloud
@@ -15,12 +14,14 @@ code  meaning
 6     the coordinate reference systems do not allow it
 7     an output cannot be written
 8     an optional part (PDAL, a model file) is missing
+70    a defect of the program itself (please report it)
 130   interrupted
 ====  ==============================================================
 """
 
 EXIT_DOUBTFUL = 3
 EXIT_REFUSED = 4
+EXIT_DEFECT = 70
 EXIT_INTERRUPTED = 130
 
 

@@ -58,7 +58,7 @@ def matrix_of(value: Any, name: str) -> Floats:
     """
     try:
         array = np.asarray(value, np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name} is no 4x4: its rows are not of equal length, or no numbers; {_ROWS}") from (
             error
         )
@@ -80,6 +80,8 @@ def matrix_of(value: Any, name: str) -> Floats:
 def _from_json(text: str, path: Path) -> TransformChain | Floats:
     try:
         document = json.loads(text)
+    except RecursionError as error:
+        raise InputError(f"{path} is nested too deeply; name a transform.json, or a 4x4") from error
     except ValueError as error:
         raise InputError(f"{path} is not JSON ({error}); name a transform.json, or a 4x4") from error
     if not isinstance(document, Mapping):

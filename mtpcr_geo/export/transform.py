@@ -153,6 +153,8 @@ def read_transform(path: str | Path) -> TransformChain:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}; name a transform.json") from error
+    except RecursionError as error:
+        raise InputError(f"{path} is nested too deeply to be a transform; name a transform.json") from error
     except ValueError as error:
         raise InputError(f"{path} is not JSON ({error}); name a transform.json") from error
     if not isinstance(document, dict) or document.get("type") != KIND:
@@ -171,7 +173,7 @@ def read_transform(path: str | Path) -> TransformChain:
             pivot=_array(document["pivot"]["source"], (3,)),
             bounds=_array(chain["source_bounds"], (2, 3)),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, IndexError) as error:
         raise InputError(
             f"{path} is damaged ({type(error).__name__}: {error}); register again to write a new one"
         ) from error

@@ -216,6 +216,9 @@ def _load(text: str | bytes, where: str) -> Any:
         raise OptionError(
             f"{where} is not JSON: line {error.lineno}, column {error.colno}: {error.msg}"
         ) from error
+    except ValueError as error:
+        # Python reads no integers of more than some thousand digits
+        raise OptionError(f"{where} holds a number of too many digits; write fewer") from error
     except RecursionError as error:
         raise OptionError(f"{where} is nested too deeply to be a pipeline") from error
 

@@ -19,6 +19,7 @@ from mtpcr_geo.core.errors import MissingPartError, OptionError
 from mtpcr_geo.core.system import sha256
 
 VARIABLE = "MTPCR_GEO_MODELS"
+_LONGEST, _MOST_DOTS = 20_000, 200
 
 
 class _Part(BaseModel):
@@ -202,10 +203,18 @@ def _text(path: Path) -> str:
 
 def _parse(name: str, text: str, where: Annotated[str, "for messages"]) -> ModelDescription:
     try:
+        # the parser takes time by the square of a key's dots
+        if len(text) > _LONGEST or any(line.count(".") > _MOST_DOTS for line in text.splitlines()):
+            raise OptionError(
+                f"the model description {where} has more than {_LONGEST} letters, or than {_MOST_DOTS} dots "
+                "in a line; shorten it"
+            )
         return ModelDescription.model_validate({"name": name, **tomllib.loads(text)})
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError:
+        raise OptionError(f"the model description {where} is nested too deeply") from None
+    except ValueError as error:
+        if isinstance(error, ValidationError):
+            problem = error.errors(include_url=False)[0]
+            at = ".".join(str(part) for part in problem["loc"]) or "description"
+            raise OptionError(f"the model description {where}: {at}: {problem['msg']}") from None
         raise OptionError(f"the model description {where} is not TOML: {error}") from None
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        at = ".".join(str(part) for part in problem["loc"]) or "description"
-        raise OptionError(f"the model description {where}: {at}: {problem['msg']}") from None
