@@ -47,6 +47,10 @@ class Inspection:
     @property
     def bounds(self) -> Floats:
         """Return the (2, 3) lowest and highest coordinates: of the points if known, else of the header."""
-        if self.scan is not None:
-            return np.stack([self.scan.minimum, self.scan.maximum])
-        return np.stack([self.cloud.minimum, self.cloud.maximum])
+        known = self.known_bounds
+        return np.stack([self.cloud.minimum, self.cloud.maximum]) if known is None else known
+
+    @property
+    def known_bounds(self) -> Floats | None:
+        """Return the (2, 3) bounds of the points without noise and no returns; None if they were not read."""
+        return None if self.scan is None else self.scan.bounds

@@ -103,7 +103,7 @@ def epochs_of(cloud: LasCloud, facts: CrsFacts | None) -> tuple[float | None, fl
 
 
 def claim_findings(
-    cloud: LasCloud, claim: Claim, declared: str | None, local: bool, role: Role, one: bool
+    cloud: LasCloud, claim: Claim, declared: str | None, local: bool, role: Role, one: bool, bounds: Floats
 ) -> Iterator[Finding]:
     """Yield what is missing or unclear in a cloud's CRS.
 
@@ -114,6 +114,7 @@ def claim_findings(
         local: whether the user declares it to be local.
         role: which cloud it is.
         one: whether it is the only one.
+        bounds: (2, 3) lowest and highest of its coordinates.
 
     """
     if declared is None and not local and cloud.crs is None:
@@ -123,10 +124,18 @@ def claim_findings(
             "crs-missing",
             role,
             f"no coordinate reference system is known ({cloud.crs_problem or 'the file states none'})"
-            f"{_guess(cloud)}",
+            f"{_guess(bounds)}",
             f"give {option} EPSG:..., or {option} local if its coordinates are local metres",
         )
-    elif cloud.crs_problem:
+    elif cloud.crs is not None and cloud.crs_problem and claim.by != "option":
+        yield Finding(
+            "note",
+            "crs-partly",
+            role,
+            cloud.crs_problem,
+            f"name the whole CRS (--{'source' if one else role}-crs), if it is known",
+        )
+    elif cloud.crs is None and cloud.crs_problem:
         yield Finding("note", "crs-unreadable", role, f"{cloud.crs_problem}; the one given by option is used")
     elif cloud.crs is not None and claim.facts is not None and claim.by == "option":
         named = claim.facts.crs
@@ -149,7 +158,7 @@ def claim_findings(
         )
     if claim.facts is not None and claim.facts.crs is not None and claim.facts.kind == "projected":
         facts = claim.facts
-        if facts.height == "unsaid" and facts.height_unit != 1.0:
+        if facts.height == "unsaid" and not facts.height_unit_stated and facts.height_unit != 1.0:
             yield Finding(
                 "note",
                 "z-unit-unsaid",
@@ -159,9 +168,9 @@ def claim_findings(
             )
 
 
-def _guess(cloud: LasCloud) -> str:
-    low, high = cloud.minimum, cloud.maximum
-    if not np.isfinite(low + high).all():
+def _guess(bounds: Floats) -> str:
+    low, high = bounds
+    if not np.isfinite(bounds).all():
         return ""
     plan = np.array([low[:2], high[:2]])
     if np.abs(plan[:, 0]).max() <= 180 and np.abs(plan[:, 1]).max() <= 90:

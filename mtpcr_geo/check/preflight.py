@@ -68,7 +68,24 @@ def _frames(
         source_crs=declared["source"],
         local=local,
         vertical=vertical,
+        target_bounds=target.known_bounds,
+        source_bounds=source.known_bounds,
     )
+
+
+def _frame_of(inspection: Inspection, declared: str | None, local: bool) -> FrameLink:
+    """Return the link of one cloud to a frame of its own."""
+    cloud, bounds = inspection.cloud, inspection.known_bounds
+    _, link, _ = resolve_frames(
+        cloud,
+        cloud,
+        target_crs=declared,
+        source_crs=declared,
+        local=local,
+        target_bounds=bounds,
+        source_bounds=bounds,
+    )
+    return link
 
 
 def check_clouds(
@@ -168,9 +185,10 @@ class _Check:
         """Inspect one cloud by itself."""
         cloud, claim, role = inspection.cloud, inspection.claim, inspection.role
         found = self.findings
-        found += place.claim_findings(cloud, claim, declared, local, role, one)
-        found += header.header_findings(cloud, claim.facts, role)
         inspection.scan = self._scan(inspection, progress)
+        found += place.claim_findings(cloud, claim, declared, local, role, one, inspection.bounds)
+        whole = inspection.bounds if inspection.scan is None else inspection.scan.whole
+        found += header.header_findings(cloud, claim.facts, role, whole)
         if claim.facts is not None:
             found += place.area_findings(claim.facts, inspection.bounds, role)
         if inspection.scan is None:
@@ -178,7 +196,7 @@ class _Check:
         found += points.noise_findings(inspection.scan, role)
         found += points.no_return_findings(inspection.scan, role)
         try:
-            _, link, _ = resolve_frames(cloud, cloud, target_crs=declared, source_crs=declared, local=local)
+            link = _frame_of(inspection, declared, local)
             sample = link.to_work(inspection.scan.sample)
         except (CrsError, InputError):
             return  # reported where the common frame is settled
@@ -194,6 +212,7 @@ class _Check:
             sample, low, high, float(link.origin[2]), dense.per_m2, dense.occupied_m2
         )
         found += points.plan_findings(inspection.measured, role)
+        found += points.storage_findings(link, inspection.scan, role)
         if inspection.is_local:
             found += upright.upright_findings(sample, role)
         if claim.facts is not None and claim.facts.kind != "geocentric":
@@ -201,26 +220,19 @@ class _Check:
             found += points.height_findings(inspection.measured, claim.facts.height_unit_name, stated, role)
 
     def _scan(self, inspection: Inspection, progress: Progress | None) -> Scan | None:
-        watched = points.Watched(inspection.cloud)
         try:
-            found = scan(watched, progress=progress)
+            found = scan(inspection.cloud, progress=progress)
         except InputError as error:
             self.refuse(error, "input", inspection.role)
             return None
-        self.findings += points.bounds_findings(inspection.cloud, watched, inspection.role)
+        self.findings += points.bounds_findings(inspection.cloud, found.whole, inspection.role)
         return found
 
     def alone(self, declared: dict[CloudRole, str | None], local: bool) -> None:
         """Settle the frame of the only cloud that could be opened."""
         for role, inspection in self.inspections.items():
             with self.stopping("crs", inspection.role):
-                resolve_frames(
-                    inspection.cloud,
-                    inspection.cloud,
-                    target_crs=declared[role],
-                    source_crs=declared[role],
-                    local=local,
-                )
+                _frame_of(inspection, declared[role], local)
 
     def compare(
         self, declared: dict[CloudRole, str | None], local: bool, vertical: Vertical

@@ -55,6 +55,8 @@ def resolve_frames(
     local: bool = False,
     vertical: Vertical = "refuse",
     out_crs: str | CRS | None = None,
+    target_bounds: Floats | None = None,
+    source_bounds: Floats | None = None,
 ) -> tuple[WorkFrame, FrameLink, FrameLink]:
     """Return the frame in which two clouds are registered, and how each is converted to it.
 
@@ -72,6 +74,9 @@ def resolve_frames(
         vertical: what to do where heights have different or unknown datums: "refuse"; "assume-same" takes
             them as equal; "estimate" takes them as they are and leaves the offset to the registration.
         out_crs: CRS of the result where that is not the target's.
+        target_bounds: (2, 3) least and greatest coordinates of the target's points, where they are known;
+            what its header states if None.
+        source_bounds: the same of the source.
 
     Returns:
         The work frame (with the way out to `out_crs` as its `output`), the target's and the source's link.
@@ -83,7 +88,8 @@ def resolve_frames(
     """
     target_facts = facts_of(None if local else _claimed(target, target_crs, "target"))
     source_facts = facts_of(None if local else _claimed(source, source_crs, "source"))
-    target_bounds, source_bounds = _bounds(target), _bounds(source)
+    target_bounds = _bounds(target) if target_bounds is None else target_bounds
+    source_bounds = _bounds(source) if source_bounds is None else source_bounds
 
     work = _work_crs(target_facts, target_bounds)
     target_link = _link(target_facts, work, target_facts, target_bounds, "assume-same")
@@ -207,7 +213,7 @@ def _heights_agree(facts: CrsFacts, other: CrsFacts, vertical: Vertical, notes: 
 
 
 def _unit_notes(facts: CrsFacts) -> tuple[str, ...]:
-    if facts.height != "unsaid" or not facts.georeferenced:
+    if facts.height != "unsaid" or facts.height_unit_stated or not facts.georeferenced:
         return ()
     return (f"the CRS states no unit of height: taken as {facts.height_unit_name}",)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from mtpcr_geo.io.las import open_cloud
 from mtpcr_geo.io.memory import cloud_of, coordinates, is_array
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.io.views import Moved
-from mtpcr_geo.io.write import returning_scales, write_cloud
+from mtpcr_geo.io.write import write_cloud
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.arrays import Floats
@@ -29,6 +30,7 @@ def apply_transform(
     inverse: bool = False,
     overwrite: bool = False,
     progress: Progress | None = None,
+    say: Callable[[str], object] | None = None,
 ) -> Path:
     """Stream a cloud through a transform into a new LAS, LAZ or COPC file.
 
@@ -41,6 +43,7 @@ def apply_transform(
         inverse: go from target to source.
         overwrite: whether `out_path` may be replaced.
         progress: where to report the points written.
+        say: called with a sentence where points were left out.
 
     Returns:
         The file written.
@@ -56,8 +59,17 @@ def apply_transform(
     out_path = Path(out_path)
     if out_path.exists() and out_path.samefile(in_path):
         raise InputError(f"{out_path} is input and output at once; write to another file")
-    write_moved(out_path, moved_by(chain, cloud, inverse=inverse), overwrite=overwrite, progress=progress)
+    moved = moved_by(chain, cloud, inverse=inverse)
+    left_out = write_moved(out_path, moved, overwrite=overwrite, progress=progress)
+    if left_out and say is not None:
+        say(left_out_text(left_out, out_path.name))
     return out_path
+
+
+def left_out_text(count: int, name: str) -> str:
+    """Return in a sentence that points were left out of a file."""
+    points = "1 point is" if count == 1 else f"{count:,} points are"
+    return f"{points} left out of {name}: too far from all others to be stored with them"
 
 
 def move(chain: TransformChain, points: CloudLike, *, inverse: bool = False) -> Floats | Cloud:
@@ -107,20 +119,19 @@ def moved_by(chain: TransformChain, cloud: Cloud, *, inverse: bool = False) -> M
 
 def write_moved(
     out_path: str | Path, moved: Moved, *, overwrite: bool = False, progress: Progress | None = None
-) -> None:
+) -> int:
     """Stream a moved cloud into a new LAS, LAZ or COPC file, with digits fine enough to move it back.
+
+    Returns:
+        The number of points left out, since they lie too far from all others to be stored with them.
 
     Raises:
         OutputError: if the output cannot be written, or exists.
 
     """
     with OutputSet(overwrite) as outputs:
-        write_cloud(
-            outputs.path(out_path),
-            moved.base,
-            moved.move,
-            moved.crs,
-            scale=tuple(returning_scales(moved.base, moved.crs)),
-            progress=progress,
+        left_out = write_cloud(
+            outputs.path(out_path), moved.base, moved.move, moved.crs, progress=progress, returning=True
         )
         outputs.commit()
+    return left_out

@@ -95,6 +95,7 @@ def side_rows(side: Side) -> list[Row]:
         ("file", Path(cloud.name).name),
         ("points", f"{cloud.count:,}"),
         *_no_return_rows(side),
+        *(("header", remark) for remark in side.remarks),
         ("CRS", crs),
         ("units", units_text(side.link)),
         *_operation_rows(side.link),

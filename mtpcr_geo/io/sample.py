@@ -31,6 +31,7 @@ class Scan(ComparesArrays):
         no_returns: of the others, points that mark beams without a return; not in the sample either.
         no_return_places: (k, 3) file coordinates where these are.
         minimum, maximum: (3,) true bounds of all other points, in file coordinates.
+        whole: (2, 3) true bounds of all points.
         sample: (n, 3) float64 file coordinates, in file order.
         complete: whether the sample is the whole cloud but for the points left out.
 
@@ -44,6 +45,12 @@ class Scan(ComparesArrays):
     maximum: Floats
     sample: Floats
     complete: bool
+    whole: Floats
+
+    @property
+    def bounds(self) -> Floats:
+        """(2, 3) true bounds of the points that are no noise and no marks of beams without a return."""
+        return np.stack([self.minimum, self.maximum])
 
 
 def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progress | None = None) -> Scan:
@@ -68,6 +75,7 @@ def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progres
     none = NoReturns(seed)
     count, dropped, no_returns, late = 0, 0, 0, False
     minimum, maximum = np.full(3, np.inf), np.full(3, -np.inf)
+    whole = np.stack([minimum, maximum])
     task: Any = nullcontext(lambda n: None)
     if progress is not None:
         task = progress.task(f"reading {cloud.name}", cloud.count)
@@ -75,6 +83,10 @@ def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progres
         for xyz, noise in cloud.noise_chunks():
             _check_finite(cloud, xyz, count)
             count += len(xyz)
+            if len(xyz):
+                whole = np.stack(
+                    [np.minimum(whole[0], xyz.min(axis=0)), np.maximum(whole[1], xyz.max(axis=0))]
+                )
             good = xyz[~noise] if noise.any() else xyz
             dropped += len(xyz) - len(good)
             before = count - len(xyz) > 0
@@ -100,7 +112,49 @@ def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progres
         maximum,
         sample,
         complete=len(sample) == count - dropped - no_returns,
+        whole=whole,
     )
+
+
+def bounds_of_some(cloud: Cloud, points: int = 50_000) -> Floats | None:
+    """Return the (2, 3) bounds of the first points that are no noise and mark no missing return, if any.
+
+    Raises:
+        InputError: if the file is truncated or damaged.
+
+    """
+    none = NoReturns()
+    for xyz in surface_chunks(cloud, points):
+        none.look(xyz)
+        good = without(xyz, none.places)
+        good = good[np.isfinite(good).all(axis=1)]
+        if len(good):
+            return np.stack([good.min(axis=0), good.max(axis=0)])
+    return None
+
+
+def header_remark(cloud: Cloud, whole: Floats) -> str | None:
+    """Return in a sentence how the bounds that a file's header states differ from those of its points.
+
+    Args:
+        cloud: the file; of a cloud that is none nothing is said.
+        whole: (2, 3) bounds of all its points.
+
+    """
+    scales = getattr(getattr(cloud, "header", None), "scales", None)
+    if scales is None:
+        return None
+    stated = np.stack([cloud.minimum, cloud.maximum])
+    tolerance = bounds_tolerance(scales, whole)
+    if np.isfinite(stated).all() and (np.abs(stated - whole) <= tolerance).all():
+        return None
+    low, high = (", ".join(f"{value:.10g}" for value in row) for row in whole)
+    return f"its header's bounds are wrong: the points lie between ({low}) and ({high}), which is used"
+
+
+def bounds_tolerance(scales: Floats, whole: Floats) -> Floats:
+    """Return by how much bounds in a header may differ from those of the points by rounding alone, (3,)."""
+    return np.asarray(np.maximum(2.0 * np.abs(scales), 1e-9 * np.abs(whole).max(axis=0)))
 
 
 def _bounds_again(cloud: Cloud, places: Floats, good: int) -> tuple[Floats, Floats, int]:

@@ -215,8 +215,10 @@ class LasWriter(Stage):
         path = context.outputs.path(self.options.filename)
         base, move = (cloud.base, cloud.move) if isinstance(cloud, Moved) else (cloud, None)
         with context.progress.task(f"writing {self.options.filename.name}", cloud.count) as advance:
-            write_cloud(path, base, move, crs, scale, advance=advance)
-        self.metadata |= {"filename": str(self.options.filename), "count": cloud.count}
+            left_out = write_cloud(path, base, move, crs, scale, advance=advance)
+        self.metadata |= {"filename": str(self.options.filename), "count": cloud.count - left_out}
+        if left_out:
+            self.metadata["left_out"] = left_out
         return cloud
 
 

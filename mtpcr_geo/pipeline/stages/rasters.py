@@ -12,7 +12,7 @@ from pydantic import Field
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
-from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.errors import CrsError, InputError, OptionError
 from mtpcr_geo.core.types import Bev, Pair, RasterSettings, Side
 from mtpcr_geo.method.bev import (
     Cells,
@@ -60,14 +60,21 @@ class Level(Stage):
     def check_inputs(self, inputs: Sequence[Value], context: RunContext) -> None:
         """Settle the frames from the headers, so that a CRS that does not do is known before the run."""
         from mtpcr_geo.io.las import check_distinct
+        from mtpcr_geo.io.sample import bounds_of_some
 
         clouds = [value for value in inputs if isinstance(value, Cloud)]
         if len(clouds) in (1, 2) and all(cloud.count for cloud in clouds):
-            self._frames(clouds[0], clouds[-1])
+            try:
+                self._frames(clouds[0], clouds[-1])
+            except (CrsError, InputError):
+                # a header is a hint: ask again by some points before refusing
+                self._frames(clouds[0], clouds[-1], [bounds_of_some(cloud) for cloud in clouds])
         if len(clouds) == 2:
             check_distinct(*clouds)
 
-    def _frames(self, target: Cloud, source: Cloud) -> tuple[WorkFrame, FrameLink, FrameLink]:
+    def _frames(
+        self, target: Cloud, source: Cloud, bounds: Sequence[Floats | None] = (None,)
+    ) -> tuple[WorkFrame, FrameLink, FrameLink]:
         from mtpcr_geo.crs import resolve_frames
 
         return resolve_frames(
@@ -78,12 +85,14 @@ class Level(Stage):
             local=self.options.local,
             vertical=self.options.vertical,
             out_crs=self.options.out_crs,
+            target_bounds=bounds[0],
+            source_bounds=bounds[-1],
         )
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Scan, sample and level each cloud."""
         from mtpcr_geo.io.las import check_distinct
-        from mtpcr_geo.io.sample import scan
+        from mtpcr_geo.io.sample import header_remark, scan
         from mtpcr_geo.method.levelling import level
 
         clouds = [value for value in inputs if isinstance(value, Cloud)]
@@ -97,7 +106,7 @@ class Level(Stage):
             scan(cloud, budget=options.budget, seed=options.seed, progress=context.progress)
             for cloud in clouds
         ]
-        frame, *links = self._frames(target, source)
+        frame, *links = self._frames(target, source, [scanned.bounds for scanned in found])
         sides = []
         roles: tuple[Literal["target", "source"], ...] = ("target", "source")
         for role, cloud, link, scanned in zip(roles, clouds, links, found, strict=False):
@@ -110,7 +119,10 @@ class Level(Stage):
                 "sampled": len(scanned.sample),
                 **levelling.audit(),
             }
-            bounds = np.stack([scanned.minimum, scanned.maximum])
+            remark = header_remark(cloud, scanned.whole)
+            remarks = () if remark is None else (remark,)
+            if remarks:
+                self.metadata[role]["header_remarks"] = list(remarks)
             sides.append(
                 Side(
                     role,
@@ -119,9 +131,10 @@ class Level(Stage):
                     sample,
                     scanned.complete,
                     levelling,
-                    bounds=bounds,
+                    bounds=scanned.bounds,
                     no_returns=scanned.no_returns,
                     no_return_places=scanned.no_return_places,
+                    remarks=remarks,
                 )
             )
         return Pair(sides[0], sides[-1], frame)
