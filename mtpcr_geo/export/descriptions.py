@@ -14,7 +14,7 @@ from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.types import IcpResult, Pair, Side, Verdict
 from mtpcr_geo.crs import FrameLink, TransformChain, facts_of
 from mtpcr_geo.export.tie_points import tie_positions
-from mtpcr_geo.export.transform import units_of
+from mtpcr_geo.export.transform import cloudcompare_of, units_of
 
 Row = tuple[str, str]
 
@@ -132,7 +132,19 @@ def transform_rows(pair: Pair) -> list[Row]:
     if moved:
         rows.append(("shift of the source's middle", moved))
     rows.append(("result in", result_text(pair)))
-    offset = TransformChain.of(pair).vertical_offset_m
+    chain = TransformChain.of(pair)
+    shifts = {
+        role: ", ".join(f"{value + 0.0:.10g}" for value in cloudcompare_of(chain)[f"{role}_global_shift"])
+        for role in ("source", "target")
+    }
+    rows.append(
+        (
+            "in CloudCompare",
+            f"global shift of the source ({shifts['source']}), of the target ({shifts['target']}): "
+            "transform.cloudcompare.txt holds with these",
+        )
+    )
+    offset = chain.vertical_offset_m
     if offset is not None:
         rows.append(("height offset found", f"{offset:+.3f} m, added to the source's heights"))
     if pair.tie_points is not None and len(pair.tie_points.target):

@@ -88,57 +88,25 @@ def write_transform_json(path: str | Path, pair: Pair, *, forced: bool = False) 
             "by_matrix": transforms.apply(T, examples[:1])[0],
         },
         "more_examples": [{"source": a, "target": b} for a, b in zip(examples[1:], moved[1:], strict=True)],
-        "cloudcompare": {key: value for key, value in _cloudcompare(chain).items() if key != "matrix"},
+        "cloudcompare": {key: value for key, value in cloudcompare_of(chain).items() if key != "matrix"},
         "files": {"source": Path(pair.source.cloud.name).name, "target": Path(pair.target.cloud.name).name},
     }
     Path(path).write_text(dumps(document) + "\n", encoding="utf-8")
 
 
 def write_cloudcompare_matrix(path: str | Path, pair: Pair) -> None:
-    """Write the 4x4 for CloudCompare: four rows of four numbers, and nothing else.
+    """Write the 4x4 for CloudCompare: four rows of four numbers, and behind them how to use it.
 
     CloudCompare holds points in single precision, less a global shift. The matrix acts on points loaded
-    with the shifts that ``transform.json`` names under ``cloudcompare``.
+    with the shifts that stand below it, and in ``transform.json`` under ``cloudcompare``. Of a text file
+    CloudCompare reads the first four lines.
     """
-    rows = _cloudcompare(TransformChain.of(pair))["matrix"]
-    text = "\n".join(" ".join(f"{value:.17g}" for value in row) for row in rows)
-    Path(path).write_text(text + "\n", encoding="utf-8")
-
-
-def write_pdal_pipeline(path: str | Path, pair: Pair) -> None:
-    """Write a PDAL pipeline that moves the source file as the chain does, and writes LAS 1.4."""
-    chain = TransformChain.of(pair)
-    source_name = pair.source.cloud.name
-    stages: list[Any] = [source_name]
-    if chain.is_affine:
-        stages.append({"type": "filters.transformation", "matrix": _row_major(chain.T_file)})
-    else:
-        inner = transforms.translation(chain.target.origin) @ chain.T_target_source
-        stages += _pdal_link(chain.source, inverse=False)
-        stages.append(
-            {
-                "type": "filters.transformation",
-                "matrix": _row_major(inner @ transforms.translation(-chain.source.origin)),
-            }
-        )
-        stages += _pdal_link(chain.target, inverse=True)
-    writer: dict[str, Any] = {
-        "type": "writers.las",
-        "filename": f"{Path(source_name).stem}_registered.laz",
-        "minor_version": 4,
-        "forward": "vlr,global_encoding",
-        "extra_dims": "all",
-        "offset_x": "auto",
-        "offset_y": "auto",
-        "offset_z": "auto",
-        "compression": True,
-    }
-    step = 1e-9 if chain.target.file_crs is not None and chain.target.file_crs.is_geographic else 0.001
-    writer |= {"scale_x": step, "scale_y": step, "scale_z": 0.001}
-    if chain.target.file_crs is not None:
-        writer["a_srs"] = chain.target.file_crs.to_wkt()
-    stages.append(writer)
-    Path(path).write_text(dumps({"pipeline": stages}) + "\n", encoding="utf-8")
+    found = cloudcompare_of(TransformChain.of(pair))
+    rows = [" ".join(f"{value:.17g}" for value in row) for row in found["matrix"]]
+    for role in ("source", "target"):
+        shift = " ".join(f"{value + 0.0:.17g}" for value in found[f"{role}_global_shift"])
+        rows.append(f"# {role} global shift: {shift}")
+    Path(path).write_text("\n".join([*rows, f"# {found['note']}"]) + "\n", encoding="utf-8")
 
 
 def read_transform(path: str | Path) -> TransformChain:
@@ -349,8 +317,8 @@ def _array(value: Any, shape: tuple[int, ...]) -> Floats:
     return array
 
 
-def _cloudcompare(chain: TransformChain) -> dict[str, Any]:
-    """Return the matrix on shifted coordinates, and the shifts with which it holds."""
+def cloudcompare_of(chain: TransformChain) -> dict[str, Any]:
+    """Return the matrix for CloudCompare, on shifted coordinates, and the shifts with which it holds."""
     source, target = _file_origin(chain.source), _file_origin(chain.target)
     if np.abs(source - target).max() < _SHARED_SHIFT:
         source = target
@@ -372,21 +340,3 @@ def _cloudcompare(chain: TransformChain) -> dict[str, Any]:
 def _file_origin(link: FrameLink) -> Floats:
     """Return whole file units near the link's origin."""
     return np.asarray(np.rint(link.to_file(np.zeros((1, 3)))[0]))
-
-
-def _row_major(T: Floats) -> str:
-    return " ".join(f"{value:.17g}" for value in T.ravel())
-
-
-def _pdal_link(link: FrameLink, inverse: bool) -> list[dict[str, Any]]:
-    """Return the PDAL stages from file to unshifted work coordinates, or back."""
-    stages: list[dict[str, Any]] = []
-    if link.pipeline is not None:
-        stages.append({"type": "filters.projpipeline", "coord_op": link.pipeline})
-        if inverse:
-            stages[0]["reverse_transfo"] = True
-    if (link.factor != 1.0).any():
-        factor = 1.0 / link.factor if inverse else link.factor
-        scale = {"type": "filters.transformation", "matrix": _row_major(np.diag([*factor, 1.0]))}
-        stages.insert(0 if inverse else len(stages), scale)
-    return stages

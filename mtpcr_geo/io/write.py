@@ -86,7 +86,7 @@ def write_cloud(
             if advance is not None:
                 advance(count - again)
 
-        scales = returning_scales(cloud, crs) if returning else _scales(cloud, crs, scale)
+        scales = returning_scales(cloud, crs) if returning else scales_of(cloud, crs, scale)
         storage = Storage(scales, None)
         try:
             _write(path, cloud, move, crs, storage, reported)
@@ -191,7 +191,17 @@ def _coarsest(crs: CRS | None) -> Floats:
     return np.full(3, STEP)
 
 
-def _scales(cloud: Cloud, crs: CRS | None, given: float | tuple[float, float, float] | None) -> Floats:
+def scales_of(
+    cloud: Cloud, crs: CRS | None, given: float | tuple[float, float, float] | None = None
+) -> Floats:
+    """Return the scales (3,) at which a cloud is written: those given, or its own within limits.
+
+    Args:
+        cloud: what is written.
+        crs: of the written coordinates.
+        given: scales asked for.
+
+    """
     if given is not None:
         return np.broadcast_to(np.asarray(given, np.float64), 3).copy()
     scales = np.full(3, STEP)

@@ -32,6 +32,20 @@ def _checked_bounds(values: list[str]) -> list[str]:
     return values
 
 
+_READER_SYNONYMS = {"spatialreference": "override_srs"}
+_WRITER_SYNONYMS = {"spatialreference": "a_srs"}
+
+
+def _without_synonyms(options: Any, synonyms: Mapping[str, str]) -> Any:
+    """Return options under the one name that each has here, of the several that PDAL takes."""
+    if not isinstance(options, Mapping):
+        return options
+    twice = [f"{old} and {new}" for old, new in synonyms.items() if old in options and new in options]
+    if twice:
+        raise ValueError(f"{twice[0]} are the same option; leave one of them out")
+    return {synonyms.get(name, name): value for name, value in options.items()}
+
+
 FileName = Annotated[Path, BeforeValidator(_path_of)]
 Bounds = Annotated[list[str], BeforeValidator(_listed), Field(min_length=1)]
 
@@ -43,6 +57,11 @@ class LasReaderOptions(StageOptions):
     count: int | None = Field(None, ge=1, description="read at most this many points, from the first on")
     override_srs: str | None = Field(None, description="CRS to take instead of what the file states")
     default_srs: str | None = Field(None, description="CRS to take where the file states none")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _synonyms(cls, options: Any) -> Any:
+        return _without_synonyms(options, _READER_SYNONYMS)
 
 
 class LasReader(Stage):
@@ -163,6 +182,7 @@ class LasWriterOptions(StageOptions):
     @model_validator(mode="before")
     @classmethod
     def _plain(cls, options: Any) -> Any:
+        options = _without_synonyms(options, _WRITER_SYNONYMS)
         compression = options.get("compression") if isinstance(options, dict) else None
         if isinstance(compression, bool):
             return {**options, "compression": str(compression).lower()}
