@@ -139,6 +139,20 @@ def no_return_findings(scan: Scan, role: Role) -> Iterator[Finding]:
         )
 
 
+def stray_findings(scan: Scan, role: Role) -> Iterator[Finding]:
+    """Yield points that lie far from all others."""
+    if scan.strays:
+        far = float(np.maximum(scan.minimum - scan.whole[0], scan.whole[1] - scan.maximum).max())
+        yield Finding(
+            "note",
+            "stray",
+            role,
+            f"{scan.strays:,} of its points lie far from all others, up to {far:,.0f} units beyond them: "
+            "they are kept in what is written, and left out of all else",
+            "classify them as noise (7 or 18), if other programs shall know",
+        )
+
+
 def height_findings(measured: Measured, unit_name: str, stated: bool, role: Role) -> Iterator[Finding]:
     """Yield heights that are no heights of a place: constant, stray, in other units, or off the earth.
 

@@ -195,6 +195,7 @@ class _Check:
             return
         found += points.noise_findings(inspection.scan, role)
         found += points.no_return_findings(inspection.scan, role)
+        found += points.stray_findings(inspection.scan, role)
         try:
             link = _frame_of(inspection, declared, local)
             sample = link.to_work(inspection.scan.sample)

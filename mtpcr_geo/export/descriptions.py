@@ -95,6 +95,7 @@ def side_rows(side: Side) -> list[Row]:
         ("file", Path(cloud.name).name),
         ("points", f"{cloud.count:,}"),
         *_no_return_rows(side),
+        *_stray_rows(side),
         *(("header", remark) for remark in side.remarks),
         ("CRS", crs),
         ("units", units_text(side.link)),
@@ -118,6 +119,13 @@ def _no_return_rows(side: Side) -> list[Row]:
     where = "; ".join(", ".join(f"{value:g}" for value in place) for place in side.no_return_places[:3])
     text = f"{side.no_returns:,} at {where}: kept in what is written, left out of all else"
     return [("points without a return", text)]
+
+
+def _stray_rows(side: Side) -> list[Row]:
+    if not side.strays:
+        return []
+    text = f"{side.strays:,}, far from all others: kept in what is written, left out of all else"
+    return [("stray points", text)]
 
 
 def transform_rows(pair: Pair) -> list[Row]:

@@ -13,6 +13,7 @@ from mtpcr_geo.core.arrays import ComparesArrays, Floats
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.io.no_returns import NoReturns, without
+from mtpcr_geo.io.strays import beyond, stray_box, within
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.progress import Progress
@@ -30,6 +31,8 @@ class Scan(ComparesArrays):
         dropped: of these, points classified as noise (7, 18) or flagged withheld; not in the sample.
         no_returns: of the others, points that mark beams without a return; not in the sample either.
         no_return_places: (k, 3) file coordinates where these are.
+        strays: of the others, points that lie far from all; not in the sample either.
+        box: (2, 3) file coordinates beyond which these lie; None where there are none.
         minimum, maximum: (3,) true bounds of all other points, in file coordinates.
         whole: (2, 3) true bounds of all points.
         sample: (n, 3) float64 file coordinates, in file order.
@@ -41,6 +44,8 @@ class Scan(ComparesArrays):
     dropped: int
     no_returns: int
     no_return_places: Floats
+    strays: int
+    box: Floats | None
     minimum: Floats
     maximum: Floats
     sample: Floats
@@ -49,7 +54,7 @@ class Scan(ComparesArrays):
 
     @property
     def bounds(self) -> Floats:
-        """(2, 3) true bounds of the points that are no noise and no marks of beams without a return."""
+        """(2, 3) true bounds of the points that are no noise, no marks of no return, and no strays."""
         return np.stack([self.minimum, self.maximum])
 
 
@@ -101,17 +106,30 @@ def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progres
     sample = kept.result()
     if late:  # a place that shows late may have points in what was read before
         sample = without(sample, none.places)
-        minimum, maximum, no_returns = _bounds_again(cloud, none.places, count - dropped)
+        minimum, maximum, no_returns = _bounds_again(cloud, none.places, None, count - dropped)
+    strays, box = 0, stray_box(sample)
+    if box is not None and not beyond(np.stack([minimum, maximum]), box).any():
+        box = None
+    if box is not None:
+        number = count - dropped - no_returns
+        sampled = len(sample) < number
+        sample = within(sample, box)
+        if sampled:
+            minimum, maximum, strays = _bounds_again(cloud, none.places, box, number)
+        else:
+            minimum, maximum, strays = sample.min(axis=0), sample.max(axis=0), number - len(sample)
     _check_usable(cloud, count, dropped, no_returns, minimum, maximum)
     return Scan(
         count,
         dropped,
         no_returns,
         none.places,
+        strays,
+        box,
         minimum,
         maximum,
         sample,
-        complete=len(sample) == count - dropped - no_returns,
+        complete=len(sample) == count - dropped - no_returns - strays,
         whole=whole,
     )
 
@@ -157,23 +175,26 @@ def bounds_tolerance(scales: Floats, whole: Floats) -> Floats:
     return np.asarray(np.maximum(2.0 * np.abs(scales), 1e-9 * np.abs(whole).max(axis=0)))
 
 
-def _bounds_again(cloud: Cloud, places: Floats, good: int) -> tuple[Floats, Floats, int]:
-    """Return the bounds without the points on some places, and the number of these among the good ones."""
+def _bounds_again(cloud: Cloud, places: Floats, box: Floats | None, good: int) -> tuple[Floats, Floats, int]:
+    """Return the bounds without the points on some places or beyond a box, and the number of these."""
     minimum, maximum, returned = np.full(3, np.inf), np.full(3, -np.inf), 0
-    for xyz in surface_chunks(cloud, places=places):
+    for xyz in surface_chunks(cloud, places=places, box=box):
         np.minimum(minimum, xyz.min(axis=0), out=minimum)
         np.maximum(maximum, xyz.max(axis=0), out=maximum)
         returned += len(xyz)
     return minimum, maximum, good - returned
 
 
-def surface_chunks(cloud: Cloud, size: int = CHUNK_POINTS, places: Floats | None = None) -> Iterator[Floats]:
+def surface_chunks(
+    cloud: Cloud, size: int = CHUNK_POINTS, places: Floats | None = None, box: Floats | None = None
+) -> Iterator[Floats]:
     """Yield the whole cloud as `scan` reads it: (n, 3) float64 file coordinates, noise left out.
 
     Args:
         cloud: what to read.
         size: points of a chunk at most.
         places: (k, 3) file coordinates whose points are left out too: those of no returns.
+        box: (2, 3) file coordinates beyond which points are left out too: strays.
 
     Raises:
         InputError: if the file is truncated or damaged.
@@ -183,6 +204,7 @@ def surface_chunks(cloud: Cloud, size: int = CHUNK_POINTS, places: Floats | None
         good = xyz[~noise] if noise.any() else xyz
         if places is not None:
             good = without(good, places)
+        good = within(good, box)
         if len(good):
             yield good
 

@@ -116,6 +116,7 @@ class Level(Stage):
                 "points": scanned.count,
                 "noise_points": scanned.dropped,
                 "no_return_points": scanned.no_returns,
+                "stray_points": scanned.strays,
                 "sampled": len(scanned.sample),
                 **levelling.audit(),
             }
@@ -134,6 +135,8 @@ class Level(Stage):
                     bounds=scanned.bounds,
                     no_returns=scanned.no_returns,
                     no_return_places=scanned.no_return_places,
+                    strays=scanned.strays,
+                    box=scanned.box,
                     remarks=remarks,
                 )
             )
@@ -234,7 +237,7 @@ def with_rasters(
 
 
 def _coverage(side: Side) -> Coverage:
-    return coverage_of(side.levelled_sample, points=side.cloud.count - side.no_returns)
+    return coverage_of(side.levelled_sample, points=side.cloud.count - side.no_returns - side.strays)
 
 
 def rasterised(side: Side, cell: float, convention: Convention, context: RunContext) -> Bev:
@@ -250,7 +253,7 @@ def _levelled_chunks(side: Side, context: RunContext) -> Iterator[Floats]:
     from mtpcr_geo.io.sample import surface_chunks
 
     with context.progress.task(f"rasterising {side.cloud.name}", side.cloud.count) as advance:
-        for xyz in surface_chunks(side.cloud, places=side.no_return_places):
+        for xyz in surface_chunks(side.cloud, places=side.no_return_places, box=side.box):
             yield transforms.apply(side.T_level_work, in_work_frame(side.link, xyz))
             advance(len(xyz))
 
