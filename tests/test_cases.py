@@ -10,6 +10,7 @@ import pytest
 
 import mtpcr_geo as mg
 from mtpcr_geo.check import CheckReport, check_clouds
+from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.io.las import open_cloud
 from mtpcr_geo.io.write import write_cloud
 
@@ -102,6 +103,38 @@ def test_bounds_that_are_no_numbers(cases):
     assert report.exit_code == 0
     assert "bounds-wrong" in codes(report)
     assert "scale-senseless" not in codes(report)
+
+
+def test_millimetres_are_named(cases):
+    files = cases / "g2_source_millimetres.las", cases / "g2_target.las"
+    report = check_clouds(*files, local=True)
+    assert report.exit_code == 5
+    unit = next(finding for finding in report.findings if finding.code == "unit")
+    assert unit.role == "source"
+    assert "--source-unit mm" in unit.fix
+    assert "raster-size" not in codes(report)
+    with pytest.raises(InputError, match="--source-unit mm"):
+        mg.register(*files, local=True)
+    report = check_clouds(*files, local=True, source_unit="mm")
+    assert report.exit_code == 0
+    assert report.clouds["source"].horizontal_unit == "millimetre"
+    missing = next(f for f in check_clouds(files[0]).findings if f.code == "crs-missing")
+    assert "in millimetres" in missing.what
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "axes"),
+    [("g3_source_y_up", "lies-on-its-side", "y-up"), ("g4_source_upside_down", "upside-down", "z-down")],
+)
+def test_axes_are_named(cases, name, code, axes):
+    files = cases / f"{name}.las", cases / "g2_target.las"
+    # also where nothing states that the cloud is local
+    for report in (check_clouds(*files, local=True), check_clouds(files[0])):
+        found = next(finding for finding in report.findings if finding.code == code)
+        assert f"--source-axes {axes}" in found.fix
+        assert "z-range" not in codes(report)
+    report = check_clouds(*files, local=True, source_axes=axes)
+    assert not {"lies-on-its-side", "upside-down", "tilted"} & codes(report)
 
 
 def test_the_frames_follow_the_points(cases):

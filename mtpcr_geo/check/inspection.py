@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.scanner import PLAIN, Scanner
 
 if TYPE_CHECKING:
     from mtpcr_geo.check.findings import CloudRole
@@ -29,6 +30,8 @@ class Inspection:
         scan: its sample and true bounds, or None where its points cannot be used.
         measured: its sample and extent in metres of a frame of its own, or None where no frame is known.
         too_large: why no raster of it can be made, or None.
+        scanner: unit and axes declared for it.
+        seems_local: whether nothing states its CRS, and its coordinates look local.
 
     """
 
@@ -38,6 +41,8 @@ class Inspection:
     scan: Scan | None = None
     measured: Measured | None = None
     too_large: RegistrationError | None = None
+    scanner: Scanner = PLAIN
+    seems_local: bool = False
 
     @property
     def is_local(self) -> bool:

@@ -26,6 +26,7 @@ FEET_A_METRE = 1.0 / 0.3048
 FEWEST_CELLS = 50
 DATUM_STEP_M, SMALL_STEP_M = 10.0, 2.0
 SAME_POINTS = 0.2
+AERIAL_TIMES = 3.0  # by which an aerial cloud is wider, and sparser, than one from the ground
 _COMPARED = 20_000
 
 
@@ -259,6 +260,22 @@ def result_findings(source: Inspection, target: Inspection) -> Iterator[Finding]
             "target",
             "it is local, so that the result has local coordinates and no CRS, though the source has one",
             "exchange the two clouds, if the result shall be in the source's CRS",
+        )
+
+
+def exchanged_findings(source: Inspection, target: Inspection) -> Iterator[Finding]:
+    """Yield that the source looks like the aerial cloud of the two: far wider and far sparser."""
+    one, other = source.measured, target.measured
+    if one is None or other is None:
+        return
+    if one.area_m2 > AERIAL_TIMES * other.area_m2 and AERIAL_TIMES * one.per_m2 < other.per_m2:
+        yield Finding(
+            "note",
+            "exchanged",
+            "both",
+            f"the source looks aerial: it covers {one.area_m2:,.0f} m2 with {one.per_m2:.3g} points per m2, "
+            f"the target {other.area_m2:,.0f} m2 with {other.per_m2:.3g}; it is the source that moves",
+            "exchange them, if the other one shall move",
         )
 
 

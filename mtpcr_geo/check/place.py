@@ -13,6 +13,7 @@ from mtpcr_geo.check.findings import Finding, Role
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError
 from mtpcr_geo.core.frames import box_points
+from mtpcr_geo.core.scanner import PLAIN, UNITS, Scanner, unit_by_size
 from mtpcr_geo.crs import CrsFacts, facts_of, parse_crs, same_place
 from mtpcr_geo.crs.facts import unbound
 from mtpcr_geo.crs.operation import area_of
@@ -44,20 +45,21 @@ class Claim:
     by: str
 
 
-def claim_of(cloud: LasCloud, declared: str | None, local: bool) -> Claim:
+def claim_of(cloud: LasCloud, declared: str | None, local: bool, scanner: Scanner = PLAIN) -> Claim:
     """Return the CRS that a cloud is taken to be in: the declared one, else that of its file.
 
     Args:
         cloud: the file.
         declared: the CRS that the user gives for it, or None.
         local: whether the user declares the cloud to be local.
+        scanner: unit and axes that the user declares for it.
 
     """
     try:
         if local:
-            return Claim(facts_of(None), "option")
+            return Claim(facts_of(None, scanner), "option")
         if declared is not None:
-            return Claim(facts_of(parse_crs(declared)), "option")
+            return Claim(facts_of(parse_crs(declared), scanner), "option")
         if cloud.crs is None:
             return Claim(None, "")
         return Claim(facts_of(cloud.crs), _stated_by(cloud))
@@ -124,8 +126,8 @@ def claim_findings(
             "crs-missing",
             role,
             f"no coordinate reference system is known ({cloud.crs_problem or 'the file states none'})"
-            f"{_guess(bounds)}",
-            f"give {option} EPSG:..., or {option} local if its coordinates are local metres",
+            f"{_guess(bounds, cloud.count)}",
+            f"give {option} EPSG:..., or {option} local if its coordinates are local",
         )
     elif cloud.crs is not None and cloud.crs_problem and claim.by != "option":
         yield Finding(
@@ -168,10 +170,24 @@ def claim_findings(
             )
 
 
-def _guess(bounds: Floats) -> str:
+def looks_local(bounds: Floats, points: int) -> bool:
+    """Return whether coordinates of no stated CRS look like those of a scan around its own origin.
+
+    Args:
+        bounds: (2, 3) lowest and highest.
+        points: their number.
+
+    """
+    return "look local" in _guess(bounds, points)
+
+
+def _guess(bounds: Floats, points: int) -> str:
     low, high = bounds
     if not np.isfinite(bounds).all():
         return ""
+    unit = unit_by_size(high - low, points)
+    if unit in ("mm", "cm"):
+        return f"; its x and y look local, in {UNITS[unit][1]}s"
     plan = np.array([low[:2], high[:2]])
     if np.abs(plan[:, 0]).max() <= 180 and np.abs(plan[:, 1]).max() <= 90:
         if np.ptp(plan, axis=0).max() < 1.0 < np.abs(low[:2]).max():

@@ -17,6 +17,7 @@ from mtpcr_geo.check.inspection import Inspection
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError, InputError, MtpcrError, OptionError, RegistrationError
 from mtpcr_geo.core.frames import box_points
+from mtpcr_geo.core.scanner import Axes, Scanner, Unit, check_unit
 from mtpcr_geo.crs import FrameLink, WorkFrame, resolve_frames
 from mtpcr_geo.crs.near import check_reach, distance_to_box, place_in_work, rim_of
 from mtpcr_geo.io.las import check_distinct, open_cloud
@@ -70,6 +71,8 @@ def _frames(
         vertical=vertical,
         target_bounds=target.known_bounds,
         source_bounds=source.known_bounds,
+        target_scanner=target.scanner,
+        source_scanner=source.scanner,
     )
 
 
@@ -84,6 +87,8 @@ def _frame_of(inspection: Inspection, declared: str | None, local: bool) -> Fram
         local=local,
         target_bounds=bounds,
         source_bounds=bounds,
+        target_scanner=inspection.scanner,
+        source_scanner=inspection.scanner,
     )
     return link
 
@@ -94,6 +99,10 @@ def check_clouds(
     *,
     source_crs: str | None = None,
     target_crs: str | None = None,
+    source_unit: Unit | None = None,
+    target_unit: Unit | None = None,
+    source_axes: Axes = "z-up",
+    target_axes: Axes = "z-up",
     local: bool = False,
     vertical: Vertical = "refuse",
     near: tuple[float, float] | None = None,
@@ -111,7 +120,9 @@ def check_clouds(
         target: the one that would stay, or None to check one file alone.
         source_crs: CRS of the source, instead of what its file states.
         target_crs: CRS of the target, likewise.
-        local: both clouds are local, in metres.
+        source_unit, target_unit: units of local clouds, if not metres.
+        source_axes, target_axes: which of their axes points up.
+        local: both clouds are local.
         vertical: what to do with different vertical datums.
         near: place near which the middle of the source lies, in the target's CRS.
         near_crs: CRS of that place, if not the target's.
@@ -134,10 +145,16 @@ def check_clouds(
     if target is not None:
         files.insert(0, ("target", target, target_crs))
     declared = {role: text for role, _, text in files}
+    scanners: dict[CloudRole, Scanner] = {
+        "source": Scanner(source_unit, source_axes),
+        "target": Scanner(target_unit, target_axes),
+    }
     for role, path, text in files:
         with check.stopping("input", role):
             cloud = open_cloud(path)
-            check.inspections[role] = Inspection(role, cloud, place.claim_of(cloud, text, local))
+            check.inspections[role] = Inspection(
+                role, cloud, place.claim_of(cloud, text, local, scanners[role]), scanner=scanners[role]
+            )
     if target is not None and len(check.inspections) == 2:
         with check.stopping("same-cloud", "both"):
             check_distinct(check.inspections["target"].cloud, check.inspections["source"].cloud)
@@ -187,6 +204,8 @@ class _Check:
         found = self.findings
         inspection.scan = self._scan(inspection, progress)
         found += place.claim_findings(cloud, claim, declared, local, role, one, inspection.bounds)
+        unknown = declared is None and not local and cloud.crs is None
+        inspection.seems_local = unknown and place.looks_local(inspection.bounds, cloud.count)
         whole = inspection.bounds if inspection.scan is None else inspection.scan.whole
         found += header.header_findings(cloud, claim.facts, role, whole)
         if claim.facts is not None:
@@ -197,10 +216,15 @@ class _Check:
         found += points.no_return_findings(inspection.scan, role)
         found += points.stray_findings(inspection.scan, role)
         try:
-            link = _frame_of(inspection, declared, local)
+            link = _frame_of(inspection, "local" if inspection.seems_local else declared, local)
+            if link.file_crs is None and link.scanner.unit is None:
+                with self.stopping("unit", role) if inspection.is_local else suppress(InputError):
+                    check_unit(cloud.name, role, inspection.scan.sample, cloud.count)
             sample = link.to_work(inspection.scan.sample)
         except (CrsError, InputError):
-            return  # reported where the common frame is settled
+            return  # reported where the common frame is settled, or in the guess at a missing CRS
+        if self.refusals and self.findings[-1].code == "unit":
+            return
         try:
             dense = coverage_of(sample, points=cloud.count)
         except RegistrationError as error:
@@ -214,9 +238,10 @@ class _Check:
         )
         found += points.plan_findings(inspection.measured, role)
         found += points.storage_findings(link, inspection.scan, role)
-        if inspection.is_local:
+        if inspection.is_local or inspection.seems_local:
             found += upright.upright_findings(sample, role)
-        if claim.facts is not None and claim.facts.kind != "geocentric":
+        upright_as_it_is = not any(one.role == role and one.code == "lies-on-its-side" for one in found)
+        if claim.facts is not None and claim.facts.kind != "geocentric" and upright_as_it_is:
             stated = claim.facts.georeferenced
             found += points.height_findings(inspection.measured, claim.facts.height_unit_name, stated, role)
 
@@ -255,6 +280,7 @@ class _Check:
         if self.relation.name != "overlapping":
             self.findings += pair.swapped_findings(source, target)
         self.findings += pair.result_findings(source, target)
+        self.findings += pair.exchanged_findings(source, target)
         self.findings += pair.same_points_findings(source, target)
         return frames
 

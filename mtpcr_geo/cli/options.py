@@ -23,8 +23,12 @@ from mtpcr_geo.pipeline.options import (
     Overwrite,
     RegisterOptions,
     Shown,
+    SourceAxes,
     SourceCrs,
+    SourceUnit,
+    TargetAxes,
     TargetCrs,
+    TargetUnit,
     Vertical,
     Within,
 )
@@ -147,6 +151,10 @@ class CheckVerb(VerbOptions):
     ] = None
     source_crs: SourceCrs = None
     target_crs: TargetCrs = None
+    source_unit: SourceUnit = None
+    target_unit: TargetUnit = None
+    source_axes: SourceAxes = "z-up"
+    target_axes: TargetAxes = "z-up"
     local: Local = False
     vertical: Vertical = "refuse"
     near: Near = None

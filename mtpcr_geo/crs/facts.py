@@ -8,6 +8,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
 from mtpcr_geo.core.errors import CrsError
+from mtpcr_geo.core.scanner import PLAIN, Scanner
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -35,6 +36,7 @@ class CrsFacts:
         height_unit: metres a unit of height.
         height_unit_name: of the unit of height.
         height_unit_stated: whether the CRS states that unit, and it is not taken from the plan.
+        scanner: unit and axes declared for local coordinates.
 
     """
 
@@ -48,6 +50,7 @@ class CrsFacts:
     height_unit: float
     height_unit_name: str
     height_unit_stated: bool = True
+    scanner: Scanner = PLAIN
 
     @property
     def name(self) -> str:
@@ -69,15 +72,20 @@ class CrsFacts:
         return "heights of no stated datum"
 
 
-def facts_of(crs: CRS | None) -> CrsFacts:
-    """Take a CRS apart; None means local metres.
+def facts_of(crs: CRS | None, scanner: Scanner = PLAIN) -> CrsFacts:
+    """Take a CRS apart; None means local coordinates.
+
+    Args:
+        crs: the CRS.
+        scanner: unit and axes of local coordinates; metres and z up if nothing is declared.
 
     Raises:
         CrsError: if it is of a kind, or has axes, that cannot be handled.
 
     """
     if crs is None:
-        return CrsFacts(None, "local", None, 1.0, "metre", "unsaid", None, 1.0, "metre")
+        unit, name = scanner.metres, scanner.unit_name
+        return CrsFacts(None, "local", None, unit, name, "unsaid", None, unit, name, True, scanner)
     horizontal, vertical = _parts(crs)
     plain = unbound(horizontal)
     axes = plain.axis_info

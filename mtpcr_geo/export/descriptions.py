@@ -188,7 +188,8 @@ def units_text(link: FrameLink) -> str:
     """Return the units of a file's coordinates, in plan and height, and what its heights refer to."""
     across, _, up = units_of(link)
     units = across if across == up else f"{across} in plan, {up} in height"
-    return f"{units}; {facts_of(link.file_crs).height_name}"
+    axes = "" if link.scanner.axes == "z-up" else f"; {link.scanner.axes}"
+    return f"{units}; {facts_of(link.file_crs).height_name}{axes}"
 
 
 def shift_text(pair: Pair) -> str:
@@ -202,7 +203,7 @@ def shift_text(pair: Pair) -> str:
         return f"{_numbers(shift, 3, sign=True)} m (east, north, up in {pair.frame.crs.name})"
     if not (pair.source.link.georeferenced or pair.target.link.georeferenced):
         moved = chain.forward(chain.pivot[None])[0]
-        shift = moved * chain.target.factor - chain.pivot * chain.source.factor
+        shift = chain.target.metric(moved) - chain.source.metric(chain.pivot)
         return f"{_numbers(shift, 3, sign=True)} m (x, y, z)"
     return ""
 

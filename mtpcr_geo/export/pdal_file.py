@@ -118,9 +118,10 @@ def _through(link: FrameLink, inverse: bool) -> Sequence[dict[str, Any]]:
         stages.append({"type": "filters.projpipeline", "coord_op": link.pipeline})
         if inverse:
             stages[0]["reverse_transfo"] = True
-    if (link.factor != 1.0).any():
-        factor = 1.0 / link.factor if inverse else link.factor
-        stages.insert(0 if inverse else len(stages), _moving(np.diag([*factor, 1.0])))
+    A = np.eye(4)
+    A[:3, :3] = link.metric(np.eye(3)).T
+    if not np.array_equal(A, np.eye(4)):
+        stages.insert(0 if inverse else len(stages), _moving(np.asarray(np.linalg.inv(A) if inverse else A)))
     return stages
 
 

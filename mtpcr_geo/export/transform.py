@@ -14,6 +14,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.core.frames import FrameLink, OperationReport, Vertical
+from mtpcr_geo.core.scanner import Axes, Scanner, Unit
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.crs.facts import facts_of
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
     from mtpcr_geo.core.types import Pair
 
-KIND, VERSION = "mtpcr-geo transform", 1
+KIND, VERSION, TURNED = "mtpcr-geo transform", 1, 2
 _SHARED_SHIFT = 10_000.0  # beyond this, single precision would show in one common shift
 _EARTH_RADIUS = 6_371_000.0
 
@@ -47,7 +48,8 @@ def write_transform_json(path: str | Path, pair: Pair, *, forced: bool = False) 
     moved = chain.forward(examples)
     document: dict[str, Any] = {
         "type": KIND,
-        "version": VERSION,
+        # programs that know no axes shall not take such a file for another
+        "version": VERSION if chain.source.scanner.axes == chain.target.scanner.axes == "z-up" else TURNED,
         "T_target_source": T,
         "T_source_target": np.linalg.inv(T) if not _is_rigid(T) else transforms.inverse(T),
         "verdict": _verdict(pair, forced),
@@ -125,9 +127,9 @@ def read_transform(path: str | Path) -> TransformChain:
         raise InputError(f"{path} is not JSON ({error}); name a transform.json") from error
     if not isinstance(document, dict) or document.get("type") != KIND:
         raise InputError(f"{path} is not a transform that this program wrote; name a transform.json")
-    if document.get("version") != VERSION:
+    if document.get("version") not in (VERSION, TURNED):
         raise InputError(
-            f"{path} is a transform of version {document.get('version')}, and this program reads {VERSION}; "
+            f"{path} is a transform of version {document.get('version')}, and this program reads {TURNED}; "
             "update it, or register again"
         )
     try:
@@ -246,7 +248,7 @@ def _motion(chain: TransformChain) -> dict[str, Any]:
 
 def units_of(link: FrameLink) -> list[str]:
     """Return the units of x, y and z in a file."""
-    facts = facts_of(link.file_crs)
+    facts = facts_of(link.file_crs, link.scanner)
     return [facts.unit_name, facts.unit_name, facts.height_unit_name]
 
 
@@ -261,8 +263,11 @@ def _crs(crs: CRS | None, wkt: bool = True) -> dict[str, Any] | None:
 def _link(link: FrameLink) -> dict[str, Any]:
     return {
         "crs": _crs(link.file_crs),
-        "steps": "work = factor * pipeline(file) - origin, element by element; no pipeline means file itself",
+        "steps": "work = factor * turned(pipeline(file)) - origin, element by element; no pipeline means "
+        "file itself, turned takes the axes to z up: of y-up (x, -z, y), of z-down (x, -y, -z)",
         "pipeline": link.pipeline,
+        "axes": link.scanner.axes,
+        "unit": link.scanner.unit,
         "factor": link.factor,
         "origin": link.origin,
         "bounds": link.bounds,
@@ -291,7 +296,17 @@ def _read_link(data: Mapping[str, Any]) -> FrameLink:
         bounds=None if data["bounds"] is None else _array(data["bounds"], (2, 3)),
         report=_read_report(data["report"]),
         georeferenced=facts_of(crs).georeferenced,
+        scanner=_read_scanner(data),
     )
+
+
+def _read_scanner(data: Mapping[str, Any]) -> Scanner:
+    # older files have neither
+    axes: Axes | None = next((one for one in get_args(Axes) if one == data.get("axes", "z-up")), None)
+    unit: Unit | None = next((one for one in get_args(Unit) if one == data.get("unit")), None)
+    if axes is None:
+        raise ValueError(f"axes are {data.get('axes')!r}")
+    return Scanner(unit, axes)
 
 
 def _read_report(data: Mapping[str, Any]) -> OperationReport:

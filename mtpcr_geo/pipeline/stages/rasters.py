@@ -13,6 +13,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import CrsError, InputError, OptionError
+from mtpcr_geo.core.scanner import Scanner, check_unit
 from mtpcr_geo.core.types import Bev, Pair, RasterSettings, Side
 from mtpcr_geo.method.bev import (
     Cells,
@@ -25,7 +26,20 @@ from mtpcr_geo.method.bev import (
     make_bev,
     rasterise,
 )
-from mtpcr_geo.pipeline.options import Cell, LevelMethod, Local, OutCrs, Seed, SourceCrs, TargetCrs, Vertical
+from mtpcr_geo.pipeline.options import (
+    Cell,
+    LevelMethod,
+    Local,
+    OutCrs,
+    Seed,
+    SourceAxes,
+    SourceCrs,
+    SourceUnit,
+    TargetAxes,
+    TargetCrs,
+    TargetUnit,
+    Vertical,
+)
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 
 if TYPE_CHECKING:
@@ -38,6 +52,10 @@ class LevelOptions(StageOptions):
     method: LevelMethod = "auto"
     target_crs: TargetCrs = None
     source_crs: SourceCrs = None
+    target_unit: TargetUnit = None
+    source_unit: SourceUnit = None
+    target_axes: TargetAxes = "z-up"
+    source_axes: SourceAxes = "z-up"
     local: Local = False
     vertical: Vertical = "refuse"
     out_crs: OutCrs = None
@@ -87,7 +105,14 @@ class Level(Stage):
             out_crs=self.options.out_crs,
             target_bounds=bounds[0],
             source_bounds=bounds[-1],
+            target_scanner=self._scanner("target"),
+            source_scanner=self._scanner("target" if source is target else "source"),
         )
+
+    def _scanner(self, role: Literal["target", "source"]) -> Scanner:
+        if role == "target":
+            return Scanner(self.options.target_unit, self.options.target_axes)
+        return Scanner(self.options.source_unit, self.options.source_axes)
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Scan, sample and level each cloud."""
@@ -110,6 +135,8 @@ class Level(Stage):
         sides = []
         roles: tuple[Literal["target", "source"], ...] = ("target", "source")
         for role, cloud, link, scanned in zip(roles, clouds, links, found, strict=False):
+            if link.file_crs is None and link.scanner.unit is None:
+                check_unit(cloud.name, role, scanned.sample, scanned.count)
             sample = in_work_frame(link, scanned.sample)
             levelling = level(sample, options.method, link.georeferenced, options.seed)
             self.metadata[role] = {
