@@ -263,7 +263,7 @@ def register(
     Nothing is written unless a folder is given; `Registration.save` writes the same files later.
 
     Args:
-        source: the cloud that moves: a LAS, LAZ or COPC file; (n, 3) coordinates in metres; `laspy.LasData`;
+        source: the cloud that moves: a file that `read` takes; (n, 3) coordinates in metres; `laspy.LasData`;
             or a `Cloud`.
         target: the cloud that stays, likewise.
         out: folder for the result and its evidence; made if it is not there.

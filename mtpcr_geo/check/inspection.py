@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from mtpcr_geo.check.place import Claim
     from mtpcr_geo.check.points import Measured
     from mtpcr_geo.core.errors import RegistrationError
+    from mtpcr_geo.io.formats.base import FileCloud
     from mtpcr_geo.io.las import LasCloud
     from mtpcr_geo.io.sample import Scan
 
@@ -36,7 +37,7 @@ class Inspection:
     """
 
     role: CloudRole
-    cloud: LasCloud
+    cloud: LasCloud | FileCloud
     claim: Claim
     scan: Scan | None = None
     measured: Measured | None = None

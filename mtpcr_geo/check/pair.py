@@ -26,6 +26,7 @@ FEET_A_METRE = 1.0 / 0.3048
 FEWEST_CELLS = 50
 DATUM_STEP_M, SMALL_STEP_M = 10.0, 2.0
 SAME_POINTS = 0.2
+SAME_STEP = 0.001  # of coordinates that are no whole numbers of steps
 AERIAL_TIMES = 3.0  # by which an aerial cloud is wider, and sparser, than one from the ground
 _COMPARED = 20_000
 
@@ -336,7 +337,10 @@ def same_points_findings(source: Inspection, target: Inspection) -> Iterator[Fin
     """Find points that stand in both clouds, coordinate by coordinate: a cloud fits itself perfectly."""
     if source.scan is None or target.scan is None:
         return
-    step = float(max(np.max(one.cloud.header.scales) for one in (source, target)))
+    step = max(
+        float(np.max(getattr(getattr(one.cloud, "header", None), "scales", 0.001)))
+        for one in (source, target)
+    )
     if not step > 0:
         return
     few = source.scan.sample[:: max(1, len(source.scan.sample) // _COMPARED)]

@@ -22,6 +22,7 @@ from mtpcr_geo.io.vlr import WKT_RECORD
 if TYPE_CHECKING:
     from pyproj import CRS
 
+    from mtpcr_geo.io.formats.base import FileCloud
     from mtpcr_geo.io.las import LasCloud
 
 # grids are used a little beyond their area, and neighbouring zones for one another; they do not break there
@@ -45,7 +46,9 @@ class Claim:
     by: str
 
 
-def claim_of(cloud: LasCloud, declared: str | None, local: bool, scanner: Scanner = PLAIN) -> Claim:
+def claim_of(
+    cloud: LasCloud | FileCloud, declared: str | None, local: bool, scanner: Scanner = PLAIN
+) -> Claim:
     """Return the CRS that a cloud is taken to be in: the declared one, else that of its file.
 
     Args:
@@ -67,7 +70,9 @@ def claim_of(cloud: LasCloud, declared: str | None, local: bool, scanner: Scanne
         return Claim(None, "")
 
 
-def _stated_by(cloud: LasCloud) -> str:
+def _stated_by(cloud: LasCloud | FileCloud) -> str:
+    if not hasattr(cloud, "records"):
+        return cloud.format
     wkt = any(record.record_id == WKT_RECORD and record.states_crs for record in cloud.records)
     return "WKT" if wkt else "GeoTIFF keys"
 
@@ -86,10 +91,10 @@ def code_of(crs: CRS | None) -> str:
     return "+".join([f"{first}:{number}", *(n if a == first else f"{a}:{n}" for a, n in rest)])
 
 
-def epochs_of(cloud: LasCloud, facts: CrsFacts | None) -> tuple[float | None, float | None]:
+def epochs_of(cloud: LasCloud | FileCloud, facts: CrsFacts | None) -> tuple[float | None, float | None]:
     """Return the epoch of the coordinates, and that at which a dynamic datum is defined, in years."""
     epoch: float | None = None
-    for record in cloud.records:
+    for record in getattr(cloud, "records", ()):
         if record.record_id == WKT_RECORD and record.states_crs:
             found = _COORDINATE_EPOCH.search(record.data.decode("utf-8", errors="replace"))
             epoch = float(found[1]) if found else epoch
@@ -105,7 +110,13 @@ def epochs_of(cloud: LasCloud, facts: CrsFacts | None) -> tuple[float | None, fl
 
 
 def claim_findings(
-    cloud: LasCloud, claim: Claim, declared: str | None, local: bool, role: Role, one: bool, bounds: Floats
+    cloud: LasCloud | FileCloud,
+    claim: Claim,
+    declared: str | None,
+    local: bool,
+    role: Role,
+    one: bool,
+    bounds: Floats,
 ) -> Iterator[Finding]:
     """Yield what is missing or unclear in a cloud's CRS.
 

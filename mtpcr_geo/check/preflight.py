@@ -20,7 +20,8 @@ from mtpcr_geo.core.frames import box_points
 from mtpcr_geo.core.scanner import Axes, Scanner, Unit, check_unit
 from mtpcr_geo.crs import FrameLink, WorkFrame, resolve_frames
 from mtpcr_geo.crs.near import check_reach, distance_to_box, place_in_work, rim_of
-from mtpcr_geo.io.las import check_distinct, open_cloud
+from mtpcr_geo.io.formats import open_any
+from mtpcr_geo.io.las import LasCloud, check_distinct
 from mtpcr_geo.io.sample import Scan, scan
 from mtpcr_geo.method.bev import coverage_of, grid_around
 
@@ -116,7 +117,7 @@ def check_clouds(
     would go on is found by the very functions that it calls, in its order.
 
     Args:
-        source: LAS, LAZ or COPC file that would move.
+        source: file that would move, of any format that `read` takes.
         target: the one that would stay, or None to check one file alone.
         source_crs: CRS of the source, instead of what its file states.
         target_crs: CRS of the target, likewise.
@@ -151,7 +152,7 @@ def check_clouds(
     }
     for role, path, text in files:
         with check.stopping("input", role):
-            cloud = open_cloud(path)
+            cloud = open_any(path)
             check.inspections[role] = Inspection(
                 role, cloud, place.claim_of(cloud, text, local, scanners[role]), scanner=scanners[role]
             )
@@ -207,7 +208,8 @@ class _Check:
         unknown = declared is None and not local and cloud.crs is None
         inspection.seems_local = unknown and place.looks_local(inspection.bounds, cloud.count)
         whole = inspection.bounds if inspection.scan is None else inspection.scan.whole
-        found += header.header_findings(cloud, claim.facts, role, whole)
+        if isinstance(cloud, LasCloud):
+            found += header.header_findings(cloud, claim.facts, role, whole)
         if claim.facts is not None:
             found += place.area_findings(claim.facts, inspection.bounds, role)
         if inspection.scan is None:
@@ -251,7 +253,8 @@ class _Check:
         except InputError as error:
             self.refuse(error, "input", inspection.role)
             return None
-        self.findings += points.bounds_findings(inspection.cloud, found.whole, inspection.role)
+        if isinstance(inspection.cloud, LasCloud):
+            self.findings += points.bounds_findings(inspection.cloud, found.whole, inspection.role)
         return found
 
     def alone(self, declared: dict[CloudRole, str | None], local: bool) -> None:

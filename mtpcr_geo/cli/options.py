@@ -33,6 +33,8 @@ from mtpcr_geo.pipeline.options import (
     Within,
 )
 
+FORMATS = "LAS, LAZ, COPC, PLY, PCD, XYZ, CSV, TXT, PTS, PTX, E57 or NPY"
+
 AsJson = Annotated[
     bool, Field(description="print the result as JSON on standard output"), Shown(OUTPUT, ("--json",))
 ]
@@ -58,12 +60,8 @@ class VerbOptions(BaseModel):
 class RegisterVerb(RegisterOptions):
     """Options of ``register``."""
 
-    source: Annotated[
-        Path, Field(description="cloud that moves: LAS, LAZ or COPC"), Shown(INPUTS, argument=True)
-    ]
-    target: Annotated[
-        Path, Field(description="cloud that stays: LAS, LAZ or COPC"), Shown(INPUTS, argument=True)
-    ]
+    source: Annotated[Path, Field(description=f"cloud that moves: {FORMATS}"), Shown(INPUTS, argument=True)]
+    target: Annotated[Path, Field(description=f"cloud that stays: {FORMATS}"), Shown(INPUTS, argument=True)]
     out: Annotated[
         Path,
         Field(description="folder for the result and its evidence; made if it is not there"),
@@ -129,7 +127,7 @@ class ApplyVerb(VerbOptions):
     ]
     cloud: Annotated[
         Path,
-        Field(description="cloud to move: LAS, LAZ or COPC, in the frame of the source"),
+        Field(description=f"cloud to move, in the frame of the source: {FORMATS}"),
         Shown(INPUTS, argument=True),
     ]
     out: Annotated[Path, Field(description="file to write: .las or .laz"), Shown(OUTPUT, argument=True)]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from mtpcr_geo.core.errors import CrsError, InputError
 from mtpcr_geo.crs.facts import same_place
 from mtpcr_geo.export.transform import read_transform
-from mtpcr_geo.io.las import open_cloud
+from mtpcr_geo.io.formats import open_any
 from mtpcr_geo.io.memory import cloud_of, coordinates, is_array
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.io.views import Moved
@@ -55,7 +55,7 @@ def apply_transform(
 
     """
     chain = read_transform(transform_path)
-    cloud = open_cloud(in_path)
+    cloud = open_any(in_path)
     out_path = Path(out_path)
     if out_path.exists() and out_path.samefile(in_path):
         raise InputError(f"{out_path} is input and output at once; write to another file")

@@ -14,6 +14,7 @@ from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.export.transform import dumps
+from mtpcr_geo.io.formats.base import FileCloud
 from mtpcr_geo.io.las import LasCloud
 from mtpcr_geo.io.layout import MODERN_FORMAT
 from mtpcr_geo.io.write import scales_of
@@ -53,6 +54,9 @@ def write_pdal_pipeline(path: str | Path, pair: Pair, folder: str | Path | None 
 
 def _reader(cloud: Cloud, folder: Path) -> dict[str, Any]:
     if not isinstance(cloud, LasCloud):
+        # PDAL finds the reader of another format by the file's ending
+        if isinstance(cloud, FileCloud):
+            return {"filename": _seen_from(folder, cloud.path)}
         return {"type": "readers.las", "filename": cloud.name}
     reader: dict[str, Any] = {"type": "readers.las", "filename": _seen_from(folder, cloud.path)}
     if cloud.extra.descriptors:

@@ -230,13 +230,14 @@ def check_distinct(target: Cloud, source: Cloud) -> None:
     """
     if target is source:
         raise InputError(f"source and target are the same cloud ({source.name}); give two different ones")
-    if not (isinstance(target, LasCloud) and isinstance(source, LasCloud)):
+    paths = [getattr(cloud, "path", None) for cloud in (target, source)]
+    if not (isinstance(paths[0], Path) and isinstance(paths[1], Path)):
         return
-    if target.path.samefile(source.path):
-        raise InputError(f"source and target are the same file ({source.path}); give two different clouds")
-    same_size = target.path.stat().st_size == source.path.stat().st_size
-    if same_size and sha256(target.path) == sha256(source.path):
+    one, other = paths[0], paths[1]
+    if one.samefile(other):
+        raise InputError(f"source and target are the same file ({other}); give two different clouds")
+    same_size = one.stat().st_size == other.stat().st_size
+    if same_size and sha256(one) == sha256(other):
         raise InputError(
-            f"source and target hold the same bytes ({source.path} and {target.path}); "
-            "give two different clouds"
+            f"source and target hold the same bytes ({other} and {one}); give two different clouds"
         )

@@ -98,14 +98,20 @@ class LasReader(Stage):
         return cloud
 
     def _open(self) -> Cloud:
-        from mtpcr_geo.io.las import open_cloud
+        from mtpcr_geo.io.formats import open_any
 
         override = stated_crs(self, "override_srs", self.options.override_srs)
         default = stated_crs(self, "default_srs", self.options.default_srs)
-        cloud: Cloud = open_cloud(self.options.filename, override)
+        cloud = open_any(self.options.filename, override)
         if cloud.crs is None and default is not None:
-            cloud = open_cloud(self.options.filename, default)
+            cloud = open_any(self.options.filename, default)
         return cloud
+
+
+class FileReader(LasReader):
+    """Read a cloud in any format that is read without PDAL: LAS, PLY, PCD, text, PTS, PTX, E57, NPY."""
+
+    type: ClassVar[str] = "mtpcr.read"
 
 
 class CopcReaderOptions(LasReaderOptions):

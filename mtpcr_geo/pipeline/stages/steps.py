@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.io.formats import LAS_ENDINGS
 from mtpcr_geo.io.memory import cloud_of
 from mtpcr_geo.pipeline.options import OUTPUT_NAMES, MethodOptions, PriorOptions
 from mtpcr_geo.pipeline.stage import Stage
@@ -26,6 +27,7 @@ from mtpcr_geo.pipeline.stages.export import (
 from mtpcr_geo.pipeline.stages.io import (
     CopcReader,
     CopcReaderOptions,
+    FileReader,
     LasReader,
     LasReaderOptions,
     LasWriter,
@@ -167,6 +169,8 @@ def reader_of(cloud: CloudLike, tag: str) -> Stage:
     path = Path(cloud)
     if path.name.lower().endswith(".copc.laz"):
         return CopcReader(CopcReaderOptions(filename=path), tag)
+    if path.suffix.lower() not in LAS_ENDINGS:
+        return FileReader(LasReaderOptions(filename=path), tag)
     return LasReader(LasReaderOptions(filename=path), tag)
 
 
