@@ -13,7 +13,7 @@ from mtpcr_geo.io.las import LasCloud
 if TYPE_CHECKING:
     from mtpcr_geo.check.inspection import Inspection
     from mtpcr_geo.crs import CrsFacts
-    from mtpcr_geo.io.formats.base import FileCloud
+    from mtpcr_geo.io.file_cloud import FileCloud
 
 
 @dataclass(frozen=True)

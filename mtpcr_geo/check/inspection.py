@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mtpcr_geo.check.place import Claim
     from mtpcr_geo.check.points import Measured
     from mtpcr_geo.core.errors import RegistrationError
-    from mtpcr_geo.io.formats.base import FileCloud
+    from mtpcr_geo.io.file_cloud import FileCloud
     from mtpcr_geo.io.las import LasCloud
     from mtpcr_geo.io.sample import Scan
 

@@ -22,7 +22,7 @@ from mtpcr_geo.io.vlr import WKT_RECORD
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from mtpcr_geo.io.formats.base import FileCloud
+    from mtpcr_geo.io.file_cloud import FileCloud
     from mtpcr_geo.io.las import LasCloud
 
 # grids are used a little beyond their area, and neighbouring zones for one another; they do not break there

@@ -33,7 +33,10 @@ from mtpcr_geo.pipeline.options import (
     Within,
 )
 
-FORMATS = "LAS, LAZ, COPC, PLY, PCD, XYZ, CSV, TXT, PTS, PTX, E57 or NPY"
+FORMATS = (
+    "LAS, LAZ, COPC, PLY, PCD, XYZ, CSV, TXT, PTS, PTX, E57 or NPY; several files as a folder, a pattern in "
+    "quotes, a .vpc or @LIST"
+)
 
 AsJson = Annotated[
     bool, Field(description="print the result as JSON on standard output"), Shown(OUTPUT, ("--json",))
@@ -130,7 +133,11 @@ class ApplyVerb(VerbOptions):
         Field(description=f"cloud to move, in the frame of the source: {FORMATS}"),
         Shown(INPUTS, argument=True),
     ]
-    out: Annotated[Path, Field(description="file to write: .las or .laz"), Shown(OUTPUT, argument=True)]
+    out: Annotated[
+        Path,
+        Field(description="file to write: .las or .laz; for several files a folder"),
+        Shown(OUTPUT, argument=True),
+    ]
     inverse: Annotated[
         bool, Field(description="move from the target's frame to the source's instead"), Shown(RUN)
     ] = False

@@ -10,6 +10,7 @@ from mtpcr_geo.core.errors import CrsError, InputError
 from mtpcr_geo.crs.facts import same_place
 from mtpcr_geo.export.transform import read_transform
 from mtpcr_geo.io.formats import open_any
+from mtpcr_geo.io.many import ManyFiles, output_names
 from mtpcr_geo.io.memory import cloud_of, coordinates, is_array
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.io.views import Moved
@@ -39,7 +40,8 @@ def apply_transform(
     Args:
         transform_path: a ``transform.json``.
         in_path: a cloud in the source's frame (in the target's with `inverse`).
-        out_path: where to write; the suffix is the format.
+        out_path: where to write; the suffix is the format. For a cloud of many files a folder, which will
+            hold a file of the same name for each.
         inverse: go from target to source.
         overwrite: whether `out_path` may be replaced.
         progress: where to report the points written.
@@ -57,7 +59,7 @@ def apply_transform(
     chain = read_transform(transform_path)
     cloud = open_any(in_path)
     out_path = Path(out_path)
-    if out_path.exists() and out_path.samefile(in_path):
+    if out_path.exists() and cloud.path.exists() and out_path.samefile(cloud.path):
         raise InputError(f"{out_path} is input and output at once; write to another file")
     moved = moved_by(chain, cloud, inverse=inverse)
     left_out = write_moved(out_path, moved, overwrite=overwrite, progress=progress)
@@ -129,9 +131,17 @@ def write_moved(
         OutputError: if the output cannot be written, or exists.
 
     """
+    parts: list[tuple[Path, Cloud]] = [(Path(out_path), moved.base)]
+    if isinstance(moved.base, ManyFiles):
+        clouds = moved.base.parts
+        names = output_names([Path(part.name) for part in clouds])
+        parts = [(Path(out_path) / name, part) for name, part in zip(names, clouds, strict=True)]
+        if Path(out_path).is_file():
+            raise InputError(f"{out_path} is a file, and {len(parts)} files are moved; name a folder")
     with OutputSet(overwrite) as outputs:
-        left_out = write_cloud(
-            outputs.path(out_path), moved.base, moved.move, moved.crs, progress=progress, returning=True
+        left_out = sum(
+            write_cloud(outputs.path(final), part, moved.move, moved.crs, progress=progress, returning=True)
+            for final, part in parts
         )
         outputs.commit()
     return left_out

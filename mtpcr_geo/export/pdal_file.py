@@ -14,7 +14,7 @@ from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.export.transform import dumps
-from mtpcr_geo.io.formats.base import FileCloud
+from mtpcr_geo.io.file_cloud import FileCloud
 from mtpcr_geo.io.las import LasCloud
 from mtpcr_geo.io.layout import MODERN_FORMAT
 from mtpcr_geo.io.write import scales_of

@@ -221,6 +221,12 @@ def _damaged(path: Path, error: BaseException) -> InputError:
     return InputError(f"{path} is truncated or damaged ({detail}); copy or download it again")
 
 
+def _files(cloud: Cloud) -> list[Path]:
+    """Return the files of a cloud, one or many, resolved; none of a cloud in memory."""
+    parts = getattr(cloud, "parts", None)
+    return [Path(one.name).resolve() for one in (parts or (cloud,)) if hasattr(one, "path")]
+
+
 def check_distinct(target: Cloud, source: Cloud) -> None:
     """Refuse one cloud given as both target and source: it would fit itself perfectly.
 
@@ -234,6 +240,11 @@ def check_distinct(target: Cloud, source: Cloud) -> None:
     if not (isinstance(paths[0], Path) and isinstance(paths[1], Path)):
         return
     one, other = paths[0], paths[1]
+    if not (one.is_file() and other.is_file()):
+        twice = set(_files(target)) & set(_files(source))
+        if twice:
+            raise InputError(f"source and target share the file {min(twice)}; give two different clouds")
+        return
     if one.samefile(other):
         raise InputError(f"source and target are the same file ({other}); give two different clouds")
     same_size = one.stat().st_size == other.stat().st_size

@@ -11,7 +11,7 @@ from mtpcr_geo.core.errors import InputError
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from mtpcr_geo.io.formats.base import FileCloud
+    from mtpcr_geo.io.file_cloud import FileCloud
     from mtpcr_geo.io.las import LasCloud
 
 LAS_ENDINGS = (".las", ".laz")
@@ -39,7 +39,7 @@ def open_any(path: str | Path, crs: CRS | None = None) -> LasCloud | FileCloud:
     """Open a cloud in any format that is read: LAS, LAZ, COPC by content, others by their ending.
 
     Args:
-        path: the file.
+        path: the file; or a folder, a pattern, a ``.vpc`` or ``@`` and a list, whose files become one cloud.
         crs: coordinate reference system to take instead of what the file states.
 
     Raises:
@@ -48,7 +48,10 @@ def open_any(path: str | Path, crs: CRS | None = None) -> LasCloud | FileCloud:
 
     """
     from mtpcr_geo.io.las import open_cloud
+    from mtpcr_geo.io.many import is_many, join
 
+    if is_many(path):
+        return join(path, [open_any(file, crs) for file in files_at(path)], crs)
     path = Path(path)
     ending = path.suffix.lower()
     if not path.is_file() or ending in LAS_ENDINGS or _begins_as_las(path):
@@ -62,6 +65,20 @@ def open_any(path: str | Path, crs: CRS | None = None) -> LasCloud | FileCloud:
         f"{path} ends in {ending or 'nothing'}, which says no format that is read ({endings}); convert it to "
         "LAS or PLY, for example by CloudCompare, or read it by a reader of PDAL in a pipeline"
     )
+
+
+def files_at(path: str | Path) -> list[Path]:
+    """Return the files that a path names: itself, or those of a folder, a pattern, a ``.vpc`` or a list.
+
+    Raises:
+        InputError: if it names several, and there is none.
+
+    """
+    from mtpcr_geo.io.many import files_of, is_many
+
+    if not is_many(path):
+        return [Path(path)]
+    return files_of(path, lambda file: file.suffix.lower() in (*LAS_ENDINGS, *MODULES))
 
 
 def _begins_as_las(path: Path) -> bool:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core.cloud import PointTable
 from mtpcr_geo.core.errors import InputError, MissingPartError
-from mtpcr_geo.io.formats.base import FileCloud, named, reported
+from mtpcr_geo.io.file_cloud import FileCloud, named, reported
 
 if TYPE_CHECKING:
     from pyproj import CRS

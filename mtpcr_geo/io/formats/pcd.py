@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core.cloud import PointTable
 from mtpcr_geo.core.errors import MissingPartError
-from mtpcr_geo.io.formats.base import FileCloud, named, reported, require_xyz
+from mtpcr_geo.io.file_cloud import FileCloud, named, reported, require_xyz
 
 if TYPE_CHECKING:
     from pyproj import CRS

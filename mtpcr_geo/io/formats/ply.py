@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core.cloud import PointTable
-from mtpcr_geo.io.formats.base import FileCloud, named, reported, require_xyz
+from mtpcr_geo.io.file_cloud import FileCloud, named, reported, require_xyz
 from mtpcr_geo.io.formats.text import rows_of
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import PointTable
-from mtpcr_geo.io.formats.base import FileCloud, named, reported
+from mtpcr_geo.io.file_cloud import FileCloud, named, reported
 from mtpcr_geo.io.formats.text import rows_of
 
 if TYPE_CHECKING:

@@ -109,9 +109,15 @@ class LasReader(Stage):
 
 
 class FileReader(LasReader):
-    """Read a cloud in any format that is read without PDAL: LAS, PLY, PCD, text, PTS, PTX, E57, NPY."""
+    """Read a cloud in any format that is read without PDAL, or many files as one."""
 
     type: ClassVar[str] = "mtpcr.read"
+
+    def reads(self) -> list[Path]:
+        """Name the files."""
+        from mtpcr_geo.io.formats import files_at
+
+        return files_at(self.options.filename)
 
 
 class CopcReaderOptions(LasReaderOptions):
@@ -242,6 +248,46 @@ class LasWriter(Stage):
         base, move = (cloud.base, cloud.move) if isinstance(cloud, Moved) else (cloud, None)
         with context.progress.task(f"writing {self.options.filename.name}", cloud.count) as advance:
             left_out = write_cloud(path, base, move, crs, scale, advance=advance)
+        self.metadata |= {"filename": str(self.options.filename), "count": cloud.count - left_out}
+        if left_out:
+            self.metadata["left_out"] = left_out
+        return cloud
+
+
+class EachWriterOptions(StageOptions):
+    """Options of mtpcr.write_each."""
+
+    filename: Path = Field(description="files to write, with a # for their names")
+    names: list[str] = Field(description="a name for each file of the cloud, in their order", min_length=1)
+
+
+class EachWriter(Stage):
+    """Write a cloud of many files as many files: LAS 1.4 or LAZ, as writers.las does."""
+
+    type: ClassVar[str] = "mtpcr.write_each"
+    Options: ClassVar[OptionsModel] = EachWriterOptions
+    options: EachWriterOptions
+
+    def writes(self) -> list[Path]:
+        """Name the files."""
+        return [self.options.filename.with_name(name) for name in self.options.names]
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Stream each part to its file, and hand the cloud on."""
+        from mtpcr_geo.io.many import ManyFiles
+        from mtpcr_geo.io.write import write_cloud
+
+        cloud = one_cloud(self, inputs)
+        base, move = (cloud.base, cloud.move) if isinstance(cloud, Moved) else (cloud, None)
+        parts = base.parts if isinstance(base, ManyFiles) else (base,)
+        if len(parts) != len(self.options.names):
+            raise OptionError(
+                f"{self.label}: {len(parts)} files are to be written, and {len(self.options.names)} named"
+            )
+        left_out = 0
+        with context.progress.task(f"writing {len(parts)} files", cloud.count) as advance:
+            for part, final in zip(parts, self.writes(), strict=True):
+                left_out += write_cloud(context.outputs.path(final), part, move, cloud.crs, advance=advance)
         self.metadata |= {"filename": str(self.options.filename), "count": cloud.count - left_out}
         if left_out:
             self.metadata["left_out"] = left_out
