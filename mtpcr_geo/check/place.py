@@ -13,7 +13,8 @@ from mtpcr_geo.check.findings import Finding, Role
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError
 from mtpcr_geo.core.frames import box_points
-from mtpcr_geo.core.scanner import PLAIN, UNITS, Scanner, unit_by_size
+from mtpcr_geo.core.scanner import PLAIN, Scanner, unit_by_size
+from mtpcr_geo.core.units import UNITS
 from mtpcr_geo.crs import CrsFacts, facts_of, parse_crs, same_place
 from mtpcr_geo.crs.facts import unbound
 from mtpcr_geo.crs.operation import area_of

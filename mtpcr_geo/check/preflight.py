@@ -17,7 +17,8 @@ from mtpcr_geo.check.inspection import Inspection
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError, InputError, MtpcrError, OptionError, RegistrationError
 from mtpcr_geo.core.frames import box_points
-from mtpcr_geo.core.scanner import Axes, Scanner, Unit, check_unit
+from mtpcr_geo.core.scanner import Scanner, check_unit
+from mtpcr_geo.core.units import Axes, Unit
 from mtpcr_geo.crs import FrameLink, WorkFrame, resolve_frames
 from mtpcr_geo.crs.near import check_reach, distance_to_box, place_in_work, rim_of
 from mtpcr_geo.io.formats import open_any

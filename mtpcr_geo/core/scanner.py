@@ -3,28 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import InputError
-
-Unit = Literal["m", "mm", "cm", "dm", "km", "in", "ft", "us-ft", "yd"]
-Axes = Literal["z-up", "y-up", "x-up", "z-down", "y-down", "x-down"]
-
-UNITS: dict[Unit, tuple[float, str]] = {
-    "m": (1.0, "metre"),
-    "mm": (0.001, "millimetre"),
-    "cm": (0.01, "centimetre"),
-    "dm": (0.1, "decimetre"),
-    "km": (1000.0, "kilometre"),
-    "in": (0.0254, "inch"),
-    "ft": (0.3048, "foot"),
-    "us-ft": (1200 / 3937, "US survey foot"),
-    "yd": (0.9144, "yard"),
-}
-"""Metres a unit, and its name."""
+from mtpcr_geo.core.units import UNITS, Axes, Unit
 
 _ROTATIONS: dict[Axes, tuple[tuple[int, int, int], ...]] = {
     "z-up": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),

@@ -14,7 +14,8 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.core.frames import FrameLink, OperationReport, Vertical
-from mtpcr_geo.core.scanner import Axes, Scanner, Unit
+from mtpcr_geo.core.scanner import Scanner
+from mtpcr_geo.core.units import Axes, Unit
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.crs.facts import facts_of
 

@@ -18,8 +18,8 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic.fields import FieldInfo
 
-from mtpcr_geo.core.scanner import UNITS, Axes, Unit
 from mtpcr_geo.core.suggestions import meant
+from mtpcr_geo.core.units import UNITS, Axes, Unit
 
 INPUTS = "Inputs and CRS"
 RASTERS = "Levelling and rasters"

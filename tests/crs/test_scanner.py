@@ -15,8 +15,9 @@ from mtpcr_geo.check import check_clouds
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import CrsError, InputError
-from mtpcr_geo.core.scanner import UNITS, Axes, Scanner, rotation_of, unit_by_size
+from mtpcr_geo.core.scanner import Scanner, rotation_of, unit_by_size
 from mtpcr_geo.core.types import Pair, Side
+from mtpcr_geo.core.units import UNITS, Axes
 from mtpcr_geo.crs import TransformChain, resolve_frames
 from mtpcr_geo.export.transform import read_transform, write_transform_json
 from mtpcr_geo.io.las import open_cloud
