@@ -32,7 +32,13 @@ from mtpcr_geo.pipeline.records import StageRecord
 from mtpcr_geo.pipeline.runner import RunResult, run
 from mtpcr_geo.pipeline.stage import Stage, chained
 from mtpcr_geo.pipeline.stages.memory import MemoryReader
-from mtpcr_geo.pipeline.stages.steps import reader_of, recording_writer, steps_of, writers_of
+from mtpcr_geo.pipeline.stages.steps import (
+    part_names,
+    reader_of,
+    recording_writer,
+    steps_of,
+    writers_of,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -193,7 +199,8 @@ class Registration:
             InputError: if an input file has changed since.
 
         """
-        stages = writers_of(Path(folder), force=force or self.force, recording=self._recording)
+        parts = part_names(self.pair.source.cloud) if self.pair is not None else []
+        stages = writers_of(Path(folder), force=force or self.force, recording=self._recording, parts=parts)
         taken = {stage.tag for stage in stages}
         last = [
             tag
@@ -208,9 +215,7 @@ class Registration:
         """Keep what a run wrote and withheld."""
         written = result.written
         self.outputs = _by_name(written.files)
-        self.not_written = {
-            name: written.withheld[path] for name, path in _by_name(tuple(written.withheld)).items()
-        }
+        self.not_written = {_name_of(path): why for path, why in written.withheld.items()}
         self.forced = written.forced
 
     def __repr__(self) -> str:
@@ -263,7 +268,7 @@ def register(
     Nothing is written unless a folder is given; `Registration.save` writes the same files later.
 
     Args:
-        source: the cloud that moves: a LAS, LAZ or COPC file; (n, 3) coordinates in metres; `laspy.LasData`;
+        source: the cloud that moves: a file that `read` takes; (n, 3) coordinates in metres; `laspy.LasData`;
             or a `Cloud`.
         target: the cloud that stays, likewise.
         out: folder for the result and its evidence; made if it is not there.
@@ -287,7 +292,8 @@ def register(
     steps = chained(steps_of(chosen), ("target", "source"))
     nodes = [*chained(readers[:1]), *chained(readers[1:]), *steps]
     if out is not None:
-        writers = writers_of(Path(out), force=chosen.force, recorded=chosen.recording)
+        parts = part_names(source)
+        writers = writers_of(Path(out), force=chosen.force, recorded=chosen.recording, parts=parts)
         nodes += chained(writers, (nodes[-1].tag,))
         recording = Path(out) / OUTPUT_NAMES["recording"]
         result = run(nodes, overwrite=chosen.overwrite, progress=progress, replaces=[recording])
@@ -359,7 +365,8 @@ def build_pipeline(
     """
     readers = [reader_of(target, "target"), reader_of(source, "source")]
     steps = chained(steps_of(options), ("target", "source"))
-    writers = writers_of(Path(out), force=options.force, recorded=options.recording)
+    parts = part_names(source)
+    writers = writers_of(Path(out), force=options.force, recorded=options.recording, parts=parts)
     nodes = [*chained(readers[:1]), *chained(readers[1:]), *steps, *chained(writers, (steps[-1].tag,))]
     # a single input is the stage before
     return [
@@ -415,10 +422,20 @@ def _crs_of_arrays(options: RegisterOptions, source: CloudLike, target: CloudLik
 
 
 def _by_name(paths: Sequence[Path]) -> dict[str, Path]:
-    """Return files of a registration by what they are."""
+    """Return files of a registration by what they are; of a source of many files, the folder of the moved."""
+    return {_name_of(path): path.parent if _is_part(path) else path for path in paths}
+
+
+def _name_of(path: Path) -> str:
+    if _is_part(path):
+        return "registered"
     names = {path.name: name for name, path in OUTPUT_NAMES.items()}
     names |= {f"{role}.tif": f"bev_{role}" for role in ("source", "target", "registered")}
-    return {names.get(path.name, path.stem): path for path in paths}
+    return names.get(path.name, path.stem)
+
+
+def _is_part(path: Path) -> bool:
+    return path.parent.name == "registered"
 
 
 def _transform_text(pair: Pair) -> str:

@@ -42,6 +42,12 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
+def shared_cases() -> Path:
+    """The folder of small inputs that stand for kinds, which stays outside the project."""
+    return _shared("cases")
+
+
+@pytest.fixture(scope="session")
 def shared_models() -> Path:
     """The folder of model files, which stays outside the project."""
     return _shared("models")

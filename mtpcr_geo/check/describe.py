@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mtpcr_geo.check.place import code_of, epochs_of
+from mtpcr_geo.io.las import LasCloud
 
 if TYPE_CHECKING:
     from mtpcr_geo.check.inspection import Inspection
     from mtpcr_geo.crs import CrsFacts
-    from mtpcr_geo.io.las import LasCloud
+    from mtpcr_geo.io.file_cloud import FileCloud
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class CloudFacts:
         area_m2: area of the occupied cells.
         extent_m: its size along the axes of the work frame.
         minimum, maximum: bounds in its own coordinates and units.
-        scale, offset: how coordinates are stored in its file.
+        scale, offset: how coordinates are stored in a LAS file; empty for other formats.
 
     """
 
@@ -82,13 +83,15 @@ def describe(inspection: Inspection) -> CloudFacts:
         extent_m=measured.extent.tolist() if measured is not None else None,
         minimum=inspection.bounds[0].tolist(),
         maximum=inspection.bounds[1].tolist(),
-        scale=np.asarray(cloud.header.scales).tolist(),
-        offset=np.asarray(cloud.header.offsets).tolist(),
+        scale=np.asarray(cloud.header.scales).tolist() if isinstance(cloud, LasCloud) else [],
+        offset=np.asarray(cloud.header.offsets).tolist() if isinstance(cloud, LasCloud) else [],
     )
 
 
-def format_of(cloud: LasCloud) -> str:
+def format_of(cloud: LasCloud | FileCloud) -> str:
     """Return a file's format, such as "LAZ 1.4, point format 6"."""
+    if not isinstance(cloud, LasCloud):
+        return cloud.format
     header = cloud.header
     kind = "LAZ" if header.are_points_compressed else "LAS"
     if any(record.user_id == "copc" for record in cloud.records):

@@ -62,20 +62,22 @@ def read_raw(cloud: LasCloud) -> RawHeader:
     return RawHeader(encoding, legacy, count, first_evlr if evlrs else 0)
 
 
-def header_findings(cloud: LasCloud, facts: CrsFacts | None, role: Role) -> Iterator[Finding]:
+def header_findings(cloud: LasCloud, facts: CrsFacts | None, role: Role, whole: Floats) -> Iterator[Finding]:
     """Yield where a file's header departs from the LAS specification, or from what programs can read.
 
     Args:
         cloud: the file, opened.
         facts: its CRS taken apart, None where it is not known.
         role: which cloud it is, for the findings.
+        whole: (2, 3) bounds of all its points, or those stated where they cannot be read.
 
     """
     raw = read_raw(cloud)
     yield from _crs_records(cloud, raw, role)
     yield from _counts(cloud, raw, role)
-    yield from _scales(cloud, facts, role)
+    yield from _scales(cloud, facts, role, whole)
     yield from _times(cloud, raw, role)
+    yield from _extra_dimensions(cloud, role)
 
 
 def _crs_records(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Finding]:
@@ -134,6 +136,11 @@ def _crs_records(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Findin
         )
 
 
+def _extra_dimensions(cloud: LasCloud, role: Role) -> Iterator[Finding]:
+    for remark in cloud.extra.remarks:
+        yield Finding("note", "extra-dimensions", role, remark)
+
+
 def _agree(one: object, other: object) -> bool:
     """Return whether two CRSs agree in what GeoTIFF keys can state: the horizontal part."""
     from mtpcr_geo.core.errors import CrsError
@@ -174,7 +181,16 @@ def _counts(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Finding]:
             f"the header's points by return add up to {by_return:,}, not to {count:,}",
             again,
         )
-    if not header.are_points_compressed:
+    if cloud.stated_count != count:
+        yield Finding(
+            "warning",
+            "count-mismatch",
+            role,
+            f"the header counts {cloud.stated_count:,} points, and there are {count:,}: all are read here, "
+            "and other programs may miss some",
+            again,
+        )
+    elif not header.are_points_compressed:
         end = raw.first_evlr or cloud.path.stat().st_size
         room = (end - header.offset_to_point_data) // header.point_format.size
         # waveforms may stand behind the points
@@ -195,9 +211,8 @@ def scales_in_metres(scales: Floats, facts: CrsFacts) -> Floats:
     return np.asarray(scales, np.float64) * [plan, plan, facts.height_unit]
 
 
-def _scales(cloud: LasCloud, facts: CrsFacts | None, role: Role) -> Iterator[Finding]:
+def _scales(cloud: LasCloud, facts: CrsFacts | None, role: Role, bounds: Floats) -> Iterator[Finding]:
     scales, offsets = np.asarray(cloud.header.scales), np.asarray(cloud.header.offsets)
-    bounds = np.stack([cloud.minimum, cloud.maximum])
     with np.errstate(all="ignore"):
         used = np.abs((bounds - offsets) / scales).max(axis=0) / 2**31
         distance = np.abs(bounds - offsets).min(axis=0)

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.scanner import PLAIN, Scanner
 
 if TYPE_CHECKING:
     from mtpcr_geo.check.findings import CloudRole
     from mtpcr_geo.check.place import Claim
     from mtpcr_geo.check.points import Measured
     from mtpcr_geo.core.errors import RegistrationError
+    from mtpcr_geo.io.file_cloud import FileCloud
     from mtpcr_geo.io.las import LasCloud
     from mtpcr_geo.io.sample import Scan
 
@@ -29,15 +31,19 @@ class Inspection:
         scan: its sample and true bounds, or None where its points cannot be used.
         measured: its sample and extent in metres of a frame of its own, or None where no frame is known.
         too_large: why no raster of it can be made, or None.
+        scanner: unit and axes declared for it.
+        seems_local: whether nothing states its CRS, and its coordinates look local.
 
     """
 
     role: CloudRole
-    cloud: LasCloud
+    cloud: LasCloud | FileCloud
     claim: Claim
     scan: Scan | None = None
     measured: Measured | None = None
     too_large: RegistrationError | None = None
+    scanner: Scanner = PLAIN
+    seems_local: bool = False
 
     @property
     def is_local(self) -> bool:
@@ -47,6 +53,10 @@ class Inspection:
     @property
     def bounds(self) -> Floats:
         """Return the (2, 3) lowest and highest coordinates: of the points if known, else of the header."""
-        if self.scan is not None:
-            return np.stack([self.scan.minimum, self.scan.maximum])
-        return np.stack([self.cloud.minimum, self.cloud.maximum])
+        known = self.known_bounds
+        return np.stack([self.cloud.minimum, self.cloud.maximum]) if known is None else known
+
+    @property
+    def known_bounds(self) -> Floats | None:
+        """Return the (2, 3) bounds of the points without noise and no returns; None if they were not read."""
+        return None if self.scan is None else self.scan.bounds

@@ -26,6 +26,8 @@ FEET_A_METRE = 1.0 / 0.3048
 FEWEST_CELLS = 50
 DATUM_STEP_M, SMALL_STEP_M = 10.0, 2.0
 SAME_POINTS = 0.2
+SAME_STEP = 0.001  # of coordinates that are no whole numbers of steps
+AERIAL_TIMES = 3.0  # by which an aerial cloud is wider, and sparser, than one from the ground
 _COMPARED = 20_000
 
 
@@ -262,6 +264,22 @@ def result_findings(source: Inspection, target: Inspection) -> Iterator[Finding]
         )
 
 
+def exchanged_findings(source: Inspection, target: Inspection) -> Iterator[Finding]:
+    """Yield that the source looks like the aerial cloud of the two: far wider and far sparser."""
+    one, other = source.measured, target.measured
+    if one is None or other is None:
+        return
+    if one.area_m2 > AERIAL_TIMES * other.area_m2 and AERIAL_TIMES * one.per_m2 < other.per_m2:
+        yield Finding(
+            "note",
+            "exchanged",
+            "both",
+            f"the source looks aerial: it covers {one.area_m2:,.0f} m2 with {one.per_m2:.3g} points per m2, "
+            f"the target {other.area_m2:,.0f} m2 with {other.per_m2:.3g}; it is the source that moves",
+            "exchange them, if the other one shall move",
+        )
+
+
 def swapped_findings(source: Inspection, target: Inspection) -> Iterator[Finding]:
     """Find x and y exchanged in one cloud against the other: apart as they stand, together if exchanged."""
     if source.claim.facts is None or target.claim.facts is None:
@@ -319,7 +337,10 @@ def same_points_findings(source: Inspection, target: Inspection) -> Iterator[Fin
     """Find points that stand in both clouds, coordinate by coordinate: a cloud fits itself perfectly."""
     if source.scan is None or target.scan is None:
         return
-    step = float(max(np.max(one.cloud.header.scales) for one in (source, target)))
+    step = max(
+        float(np.max(getattr(getattr(one.cloud, "header", None), "scales", 0.001)))
+        for one in (source, target)
+    )
     if not step > 0:
         return
     few = source.scan.sample[:: max(1, len(source.scan.sample) // _COMPARED)]

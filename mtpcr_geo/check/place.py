@@ -13,6 +13,8 @@ from mtpcr_geo.check.findings import Finding, Role
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError
 from mtpcr_geo.core.frames import box_points
+from mtpcr_geo.core.scanner import PLAIN, Scanner, unit_by_size
+from mtpcr_geo.core.units import UNITS
 from mtpcr_geo.crs import CrsFacts, facts_of, parse_crs, same_place
 from mtpcr_geo.crs.facts import unbound
 from mtpcr_geo.crs.operation import area_of
@@ -21,6 +23,7 @@ from mtpcr_geo.io.vlr import WKT_RECORD
 if TYPE_CHECKING:
     from pyproj import CRS
 
+    from mtpcr_geo.io.file_cloud import FileCloud
     from mtpcr_geo.io.las import LasCloud
 
 # grids are used a little beyond their area, and neighbouring zones for one another; they do not break there
@@ -44,20 +47,23 @@ class Claim:
     by: str
 
 
-def claim_of(cloud: LasCloud, declared: str | None, local: bool) -> Claim:
+def claim_of(
+    cloud: LasCloud | FileCloud, declared: str | None, local: bool, scanner: Scanner = PLAIN
+) -> Claim:
     """Return the CRS that a cloud is taken to be in: the declared one, else that of its file.
 
     Args:
         cloud: the file.
         declared: the CRS that the user gives for it, or None.
         local: whether the user declares the cloud to be local.
+        scanner: unit and axes that the user declares for it.
 
     """
     try:
         if local:
-            return Claim(facts_of(None), "option")
+            return Claim(facts_of(None, scanner), "option")
         if declared is not None:
-            return Claim(facts_of(parse_crs(declared)), "option")
+            return Claim(facts_of(parse_crs(declared), scanner), "option")
         if cloud.crs is None:
             return Claim(None, "")
         return Claim(facts_of(cloud.crs), _stated_by(cloud))
@@ -65,7 +71,9 @@ def claim_of(cloud: LasCloud, declared: str | None, local: bool) -> Claim:
         return Claim(None, "")
 
 
-def _stated_by(cloud: LasCloud) -> str:
+def _stated_by(cloud: LasCloud | FileCloud) -> str:
+    if not hasattr(cloud, "records"):
+        return cloud.format
     wkt = any(record.record_id == WKT_RECORD and record.states_crs for record in cloud.records)
     return "WKT" if wkt else "GeoTIFF keys"
 
@@ -84,10 +92,10 @@ def code_of(crs: CRS | None) -> str:
     return "+".join([f"{first}:{number}", *(n if a == first else f"{a}:{n}" for a, n in rest)])
 
 
-def epochs_of(cloud: LasCloud, facts: CrsFacts | None) -> tuple[float | None, float | None]:
+def epochs_of(cloud: LasCloud | FileCloud, facts: CrsFacts | None) -> tuple[float | None, float | None]:
     """Return the epoch of the coordinates, and that at which a dynamic datum is defined, in years."""
     epoch: float | None = None
-    for record in cloud.records:
+    for record in getattr(cloud, "records", ()):
         if record.record_id == WKT_RECORD and record.states_crs:
             found = _COORDINATE_EPOCH.search(record.data.decode("utf-8", errors="replace"))
             epoch = float(found[1]) if found else epoch
@@ -103,7 +111,13 @@ def epochs_of(cloud: LasCloud, facts: CrsFacts | None) -> tuple[float | None, fl
 
 
 def claim_findings(
-    cloud: LasCloud, claim: Claim, declared: str | None, local: bool, role: Role, one: bool
+    cloud: LasCloud | FileCloud,
+    claim: Claim,
+    declared: str | None,
+    local: bool,
+    role: Role,
+    one: bool,
+    bounds: Floats,
 ) -> Iterator[Finding]:
     """Yield what is missing or unclear in a cloud's CRS.
 
@@ -114,6 +128,7 @@ def claim_findings(
         local: whether the user declares it to be local.
         role: which cloud it is.
         one: whether it is the only one.
+        bounds: (2, 3) lowest and highest of its coordinates.
 
     """
     if declared is None and not local and cloud.crs is None:
@@ -123,10 +138,18 @@ def claim_findings(
             "crs-missing",
             role,
             f"no coordinate reference system is known ({cloud.crs_problem or 'the file states none'})"
-            f"{_guess(cloud)}",
-            f"give {option} EPSG:..., or {option} local if its coordinates are local metres",
+            f"{_guess(bounds, cloud.count)}",
+            f"give {option} EPSG:..., or {option} local if its coordinates are local",
         )
-    elif cloud.crs_problem:
+    elif cloud.crs is not None and cloud.crs_problem and claim.by != "option":
+        yield Finding(
+            "note",
+            "crs-partly",
+            role,
+            cloud.crs_problem,
+            f"name the whole CRS (--{'source' if one else role}-crs), if it is known",
+        )
+    elif cloud.crs is None and cloud.crs_problem:
         yield Finding("note", "crs-unreadable", role, f"{cloud.crs_problem}; the one given by option is used")
     elif cloud.crs is not None and claim.facts is not None and claim.by == "option":
         named = claim.facts.crs
@@ -149,7 +172,7 @@ def claim_findings(
         )
     if claim.facts is not None and claim.facts.crs is not None and claim.facts.kind == "projected":
         facts = claim.facts
-        if facts.height == "unsaid" and facts.height_unit != 1.0:
+        if facts.height == "unsaid" and not facts.height_unit_stated and facts.height_unit != 1.0:
             yield Finding(
                 "note",
                 "z-unit-unsaid",
@@ -159,10 +182,24 @@ def claim_findings(
             )
 
 
-def _guess(cloud: LasCloud) -> str:
-    low, high = cloud.minimum, cloud.maximum
-    if not np.isfinite(low + high).all():
+def looks_local(bounds: Floats, points: int) -> bool:
+    """Return whether coordinates of no stated CRS look like those of a scan around its own origin.
+
+    Args:
+        bounds: (2, 3) lowest and highest.
+        points: their number.
+
+    """
+    return "look local" in _guess(bounds, points)
+
+
+def _guess(bounds: Floats, points: int) -> str:
+    low, high = bounds
+    if not np.isfinite(bounds).all():
         return ""
+    unit = unit_by_size(high - low, points)
+    if unit in ("mm", "cm"):
+        return f"; its x and y look local, in {UNITS[unit][1]}s"
     plan = np.array([low[:2], high[:2]])
     if np.abs(plan[:, 0]).max() <= 180 and np.abs(plan[:, 1]).max() <= 90:
         if np.ptp(plan, axis=0).max() < 1.0 < np.abs(low[:2]).max():

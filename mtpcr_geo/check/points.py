@@ -9,10 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mtpcr_geo.check.findings import Finding, Role, rewrite
-from mtpcr_geo.core.arrays import ComparesArrays, Floats, Mask
-from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
+from mtpcr_geo.core.arrays import ComparesArrays, Floats
+from mtpcr_geo.core.errors import CrsError
+from mtpcr_geo.core.frames import box_points
+from mtpcr_geo.io.sample import bounds_tolerance
+from mtpcr_geo.io.storage import MOST_STEPS
+from mtpcr_geo.io.write import STEP
 
 if TYPE_CHECKING:
+    from mtpcr_geo.core.frames import FrameLink
     from mtpcr_geo.io.las import LasCloud
     from mtpcr_geo.io.sample import Scan
 
@@ -22,31 +27,6 @@ TALLEST_M = 1500.0
 TALLEST_GROWN_OR_BUILT_M = 120.0
 """Trees grow no higher, and few buildings: a plot may well be narrower than what stands on it is high."""
 LOWEST_LAND_M, HIGHEST_LAND_M = -500.0, 9000.0
-
-
-class Watched(Cloud):
-    """A cloud that notes the bounds of all its points, noise included, while it is streamed."""
-
-    def __init__(self, cloud: Cloud) -> None:
-        self.cloud = cloud
-        self.name, self.crs, self.count = cloud.name, cloud.crs, cloud.count
-        self.minimum, self.maximum = cloud.minimum, cloud.maximum
-        self.seen_minimum, self.seen_maximum = np.full(3, np.inf), np.full(3, -np.inf)
-
-    def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
-        """Yield (n, 3) coordinates of the cloud watched."""
-        yield from self.cloud.xyz_chunks(size)
-
-    def table_chunks(self, size: int = CHUNK_POINTS) -> Iterator[PointTable]:
-        """Yield tables of the cloud watched."""
-        yield from self.cloud.table_chunks(size)
-
-    def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, Mask]]:
-        """Yield coordinates and which points are noise, and note the bounds."""
-        for xyz, noise in self.cloud.noise_chunks(size):
-            np.fmin(self.seen_minimum, np.fmin.reduce(xyz, axis=0), out=self.seen_minimum)
-            np.fmax(self.seen_maximum, np.fmax.reduce(xyz, axis=0), out=self.seen_maximum)
-            yield xyz, noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +55,22 @@ class Measured(ComparesArrays):
         return np.asarray(self.high - self.low)
 
 
-def bounds_findings(cloud: LasCloud, watched: Watched, role: Role) -> Iterator[Finding]:
-    """Yield where the header's bounds differ from those of the points read."""
-    if not (np.isfinite(watched.seen_minimum).all() and np.isfinite(cloud.minimum + cloud.maximum).all()):
+def bounds_findings(cloud: LasCloud, whole: Floats, role: Role) -> Iterator[Finding]:
+    """Yield where the header's bounds differ from those of the points read, (2, 3)."""
+    low, high = whole
+    tolerance = bounds_tolerance(np.asarray(cloud.header.scales), whole)
+    if not np.isfinite([cloud.minimum, cloud.maximum]).all():
+        yield Finding(
+            "warning",
+            "bounds-wrong",
+            role,
+            "the header's bounds are no finite numbers: the points are used, and programs that trust the "
+            "header will not find them",
+            rewrite(cloud.path),
+        )
         return
-    tolerance = np.maximum(2.0 * np.asarray(cloud.header.scales), 1e-9 * np.abs(watched.seen_maximum))
-    outside = np.maximum(cloud.minimum - watched.seen_minimum, watched.seen_maximum - cloud.maximum)
-    spare = np.maximum(watched.seen_minimum - cloud.minimum, cloud.maximum - watched.seen_maximum)
+    outside = np.maximum(cloud.minimum - low, high - cloud.maximum)
+    spare = np.maximum(low - cloud.minimum, cloud.maximum - high)
     if (outside > tolerance).any():
         axis = int((outside / tolerance).argmax())
         yield Finding(
@@ -94,13 +83,31 @@ def bounds_findings(cloud: LasCloud, watched: Watched, role: Role) -> Iterator[F
         )
     elif (spare > tolerance).any():
         axis = int((spare / tolerance).argmax())
-        extent = float((watched.seen_maximum - watched.seen_minimum)[axis])
+        extent = float((high - low)[axis])
         yield Finding(
             "warning" if spare[axis] > max(extent, 1.0) else "note",
             "bounds-wide",
             role,
             f"the header's bounds extend up to {spare[axis]:.6g} units beyond the points in {'xyz'[axis]}",
             rewrite(cloud.path),
+        )
+
+
+def storage_findings(link: FrameLink, scan: Scan, role: Role) -> Iterator[Finding]:
+    """Yield that some points lie too far from the others to be stored with them in one file."""
+    try:
+        corners = link.to_work(box_points(scan.whole, 2))
+    except CrsError:
+        return  # noise or marks at a place where the CRS means nothing
+    apart = float(np.ptp(corners, axis=0).max())
+    if role != "target" and not apart / 2 <= STEP * MOST_STEPS:
+        yield Finding(
+            "note",
+            "points-far",
+            role,
+            f"some of its points lie {apart / 1000:,.0f} km from others: those that do not fit a LAS file at "
+            f"a scale of {STEP:g} m will be left out of what is written, and counted",
+            "remove them beforehand, or write with a coarser scale (scale_x ... of writers.las)",
         )
 
 
@@ -129,6 +136,20 @@ def no_return_findings(scan: Scan, role: Role) -> Iterator[Finding]:
             role,
             f"{scan.no_returns:,} of its points ({scan.no_returns / scan.count:.1%}) lie exactly at {where}: "
             "beams without a return; they are kept in what is written, and left out of all else",
+        )
+
+
+def stray_findings(scan: Scan, role: Role) -> Iterator[Finding]:
+    """Yield points that lie far from all others."""
+    if scan.strays:
+        far = float(np.maximum(scan.minimum - scan.whole[0], scan.whole[1] - scan.maximum).max())
+        yield Finding(
+            "note",
+            "stray",
+            role,
+            f"{scan.strays:,} of its points lie far from all others, up to {far:,.0f} units beyond them: "
+            "they are kept in what is written, and left out of all else",
+            "classify them as noise (7 or 18), if other programs shall know",
         )
 
 

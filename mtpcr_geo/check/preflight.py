@@ -17,9 +17,12 @@ from mtpcr_geo.check.inspection import Inspection
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError, InputError, MtpcrError, OptionError, RegistrationError
 from mtpcr_geo.core.frames import box_points
+from mtpcr_geo.core.scanner import Scanner, check_unit
+from mtpcr_geo.core.units import Axes, Unit
 from mtpcr_geo.crs import FrameLink, WorkFrame, resolve_frames
 from mtpcr_geo.crs.near import check_reach, distance_to_box, place_in_work, rim_of
-from mtpcr_geo.io.las import check_distinct, open_cloud
+from mtpcr_geo.io.formats import open_any
+from mtpcr_geo.io.las import LasCloud, check_distinct
 from mtpcr_geo.io.sample import Scan, scan
 from mtpcr_geo.method.bev import coverage_of, grid_around
 
@@ -68,7 +71,28 @@ def _frames(
         source_crs=declared["source"],
         local=local,
         vertical=vertical,
+        target_bounds=target.known_bounds,
+        source_bounds=source.known_bounds,
+        target_scanner=target.scanner,
+        source_scanner=source.scanner,
     )
+
+
+def _frame_of(inspection: Inspection, declared: str | None, local: bool) -> FrameLink:
+    """Return the link of one cloud to a frame of its own."""
+    cloud, bounds = inspection.cloud, inspection.known_bounds
+    _, link, _ = resolve_frames(
+        cloud,
+        cloud,
+        target_crs=declared,
+        source_crs=declared,
+        local=local,
+        target_bounds=bounds,
+        source_bounds=bounds,
+        target_scanner=inspection.scanner,
+        source_scanner=inspection.scanner,
+    )
+    return link
 
 
 def check_clouds(
@@ -77,6 +101,10 @@ def check_clouds(
     *,
     source_crs: str | None = None,
     target_crs: str | None = None,
+    source_unit: Unit | None = None,
+    target_unit: Unit | None = None,
+    source_axes: Axes = "z-up",
+    target_axes: Axes = "z-up",
     local: bool = False,
     vertical: Vertical = "refuse",
     near: tuple[float, float] | None = None,
@@ -90,11 +118,13 @@ def check_clouds(
     would go on is found by the very functions that it calls, in its order.
 
     Args:
-        source: LAS, LAZ or COPC file that would move.
+        source: file that would move, of any format that `read` takes.
         target: the one that would stay, or None to check one file alone.
         source_crs: CRS of the source, instead of what its file states.
         target_crs: CRS of the target, likewise.
-        local: both clouds are local, in metres.
+        source_unit, target_unit: units of local clouds, if not metres.
+        source_axes, target_axes: which of their axes points up.
+        local: both clouds are local.
         vertical: what to do with different vertical datums.
         near: place near which the middle of the source lies, in the target's CRS.
         near_crs: CRS of that place, if not the target's.
@@ -117,10 +147,16 @@ def check_clouds(
     if target is not None:
         files.insert(0, ("target", target, target_crs))
     declared = {role: text for role, _, text in files}
+    scanners: dict[CloudRole, Scanner] = {
+        "source": Scanner(source_unit, source_axes),
+        "target": Scanner(target_unit, target_axes),
+    }
     for role, path, text in files:
         with check.stopping("input", role):
-            cloud = open_cloud(path)
-            check.inspections[role] = Inspection(role, cloud, place.claim_of(cloud, text, local))
+            cloud = open_any(path)
+            check.inspections[role] = Inspection(
+                role, cloud, place.claim_of(cloud, text, local, scanners[role]), scanner=scanners[role]
+            )
     if target is not None and len(check.inspections) == 2:
         with check.stopping("same-cloud", "both"):
             check_distinct(check.inspections["target"].cloud, check.inspections["source"].cloud)
@@ -168,20 +204,30 @@ class _Check:
         """Inspect one cloud by itself."""
         cloud, claim, role = inspection.cloud, inspection.claim, inspection.role
         found = self.findings
-        found += place.claim_findings(cloud, claim, declared, local, role, one)
-        found += header.header_findings(cloud, claim.facts, role)
         inspection.scan = self._scan(inspection, progress)
+        found += place.claim_findings(cloud, claim, declared, local, role, one, inspection.bounds)
+        unknown = declared is None and not local and cloud.crs is None
+        inspection.seems_local = unknown and place.looks_local(inspection.bounds, cloud.count)
+        whole = inspection.bounds if inspection.scan is None else inspection.scan.whole
+        if isinstance(cloud, LasCloud):
+            found += header.header_findings(cloud, claim.facts, role, whole)
         if claim.facts is not None:
             found += place.area_findings(claim.facts, inspection.bounds, role)
         if inspection.scan is None:
             return
         found += points.noise_findings(inspection.scan, role)
         found += points.no_return_findings(inspection.scan, role)
+        found += points.stray_findings(inspection.scan, role)
         try:
-            _, link, _ = resolve_frames(cloud, cloud, target_crs=declared, source_crs=declared, local=local)
+            link = _frame_of(inspection, "local" if inspection.seems_local else declared, local)
+            if link.file_crs is None and link.scanner.unit is None:
+                with self.stopping("unit", role) if inspection.is_local else suppress(InputError):
+                    check_unit(cloud.name, role, inspection.scan.sample, cloud.count)
             sample = link.to_work(inspection.scan.sample)
         except (CrsError, InputError):
-            return  # reported where the common frame is settled
+            return  # reported where the common frame is settled, or in the guess at a missing CRS
+        if self.refusals and self.findings[-1].code == "unit":
+            return
         try:
             dense = coverage_of(sample, points=cloud.count)
         except RegistrationError as error:
@@ -194,33 +240,29 @@ class _Check:
             sample, low, high, float(link.origin[2]), dense.per_m2, dense.occupied_m2
         )
         found += points.plan_findings(inspection.measured, role)
-        if inspection.is_local:
+        found += points.storage_findings(link, inspection.scan, role)
+        if inspection.is_local or inspection.seems_local:
             found += upright.upright_findings(sample, role)
-        if claim.facts is not None and claim.facts.kind != "geocentric":
+        upright_as_it_is = not any(one.role == role and one.code == "lies-on-its-side" for one in found)
+        if claim.facts is not None and claim.facts.kind != "geocentric" and upright_as_it_is:
             stated = claim.facts.georeferenced
             found += points.height_findings(inspection.measured, claim.facts.height_unit_name, stated, role)
 
     def _scan(self, inspection: Inspection, progress: Progress | None) -> Scan | None:
-        watched = points.Watched(inspection.cloud)
         try:
-            found = scan(watched, progress=progress)
+            found = scan(inspection.cloud, progress=progress)
         except InputError as error:
             self.refuse(error, "input", inspection.role)
             return None
-        self.findings += points.bounds_findings(inspection.cloud, watched, inspection.role)
+        if isinstance(inspection.cloud, LasCloud):
+            self.findings += points.bounds_findings(inspection.cloud, found.whole, inspection.role)
         return found
 
     def alone(self, declared: dict[CloudRole, str | None], local: bool) -> None:
         """Settle the frame of the only cloud that could be opened."""
         for role, inspection in self.inspections.items():
             with self.stopping("crs", inspection.role):
-                resolve_frames(
-                    inspection.cloud,
-                    inspection.cloud,
-                    target_crs=declared[role],
-                    source_crs=declared[role],
-                    local=local,
-                )
+                _frame_of(inspection, declared[role], local)
 
     def compare(
         self, declared: dict[CloudRole, str | None], local: bool, vertical: Vertical
@@ -242,6 +284,7 @@ class _Check:
         if self.relation.name != "overlapping":
             self.findings += pair.swapped_findings(source, target)
         self.findings += pair.result_findings(source, target)
+        self.findings += pair.exchanged_findings(source, target)
         self.findings += pair.same_points_findings(source, target)
         return frames
 

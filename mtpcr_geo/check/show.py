@@ -123,5 +123,7 @@ def _numbers(values: Sequence[float], decimals: int, between: str) -> str:
 
 
 def _triple(values: Sequence[float]) -> str:
+    if not values:
+        return _UNKNOWN
     same = len(set(values)) == 1
     return f"{values[0] + 0.0:g}" if same else "  ".join(f"{value + 0.0:.10g}" for value in values)

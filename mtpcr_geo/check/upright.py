@@ -19,6 +19,7 @@ _TURN = {
     "-y": "(x, y, z) to (x, z, -y)",
     "-z": "(x, y, z) to (x, -y, -z)",
 }
+_AXES = {"x": "x-up", "-x": "x-down", "y": "y-up", "-y": "y-down", "-z": "z-down"}
 _ITSELF = "register levels it by itself where both clouds tell enough (--level auto)"
 
 
@@ -40,5 +41,9 @@ def upright_findings(xyz: Floats, role: Role) -> Iterator[Finding]:
     else:
         return
     code = "upside-down" if tilt > ON_ITS_HEAD_DEG else "lies-on-its-side"
-    fix = f"{_ITSELF}; or turn it beforehand, {_TURN[name]}" if name in _TURN else _ITSELF
+    fix = (
+        f"give --{role}-axes {_AXES[name]}, which takes {_TURN[name]}; {_ITSELF}"
+        if name in _TURN
+        else _ITSELF
+    )
     yield Finding("warning", code, role, what, fix)

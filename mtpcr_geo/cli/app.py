@@ -92,6 +92,12 @@ class Command(TyperCommand):
         try:
             return super().parse_args(ctx, args)
         except _UsageError as error:
+            if "extra argument" in str(error):
+                raise OptionError(
+                    f"{NAME} {self.name}: {str(error).rstrip('.').lower()}; several files as one cloud are a "
+                    "folder, a pattern in quotes ('tiles/*.laz'), a .vpc, or @ and a text file with a path a "
+                    f"line; see {NAME} {self.name} --help"
+                ) from None
             known = [name for one in self.get_params(ctx) for name in (*one.opts, *one.secondary_opts)]
             raise _option_error(
                 error, f"{NAME} {self.name}", [name for name in known if name.startswith("--")]

@@ -29,6 +29,7 @@ def run(options: ApplyVerb) -> None:
             inverse=options.inverse,
             overwrite=options.overwrite,
             progress=progress,
+            say=lambda text: typer.echo(one_line(f"mtpcr-geo: warning: {text}"), err=True),
         )
     doubts = doubts_of(options.transform)
     if doubts is not None:

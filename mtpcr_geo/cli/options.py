@@ -23,10 +23,19 @@ from mtpcr_geo.pipeline.options import (
     Overwrite,
     RegisterOptions,
     Shown,
+    SourceAxes,
     SourceCrs,
+    SourceUnit,
+    TargetAxes,
     TargetCrs,
+    TargetUnit,
     Vertical,
     Within,
+)
+
+FORMATS = (
+    "LAS, LAZ, COPC, PLY, PCD, XYZ, CSV, TXT, PTS, PTX, E57 or NPY; several files as a folder, a pattern in "
+    "quotes, a .vpc or @LIST"
 )
 
 AsJson = Annotated[
@@ -54,12 +63,8 @@ class VerbOptions(BaseModel):
 class RegisterVerb(RegisterOptions):
     """Options of ``register``."""
 
-    source: Annotated[
-        Path, Field(description="cloud that moves: LAS, LAZ or COPC"), Shown(INPUTS, argument=True)
-    ]
-    target: Annotated[
-        Path, Field(description="cloud that stays: LAS, LAZ or COPC"), Shown(INPUTS, argument=True)
-    ]
+    source: Annotated[Path, Field(description=f"cloud that moves: {FORMATS}"), Shown(INPUTS, argument=True)]
+    target: Annotated[Path, Field(description=f"cloud that stays: {FORMATS}"), Shown(INPUTS, argument=True)]
     out: Annotated[
         Path,
         Field(description="folder for the result and its evidence; made if it is not there"),
@@ -125,10 +130,14 @@ class ApplyVerb(VerbOptions):
     ]
     cloud: Annotated[
         Path,
-        Field(description="cloud to move: LAS, LAZ or COPC, in the frame of the source"),
+        Field(description=f"cloud to move, in the frame of the source: {FORMATS}"),
         Shown(INPUTS, argument=True),
     ]
-    out: Annotated[Path, Field(description="file to write: .las or .laz"), Shown(OUTPUT, argument=True)]
+    out: Annotated[
+        Path,
+        Field(description="file to write: .las or .laz; for several files a folder"),
+        Shown(OUTPUT, argument=True),
+    ]
     inverse: Annotated[
         bool, Field(description="move from the target's frame to the source's instead"), Shown(RUN)
     ] = False
@@ -147,6 +156,10 @@ class CheckVerb(VerbOptions):
     ] = None
     source_crs: SourceCrs = None
     target_crs: TargetCrs = None
+    source_unit: SourceUnit = None
+    target_unit: TargetUnit = None
+    source_axes: SourceAxes = "z-up"
+    target_axes: TargetAxes = "z-up"
     local: Local = False
     vertical: Vertical = "refuse"
     near: Near = None

@@ -75,7 +75,7 @@ def print_registration(
         _print_stages(result.report)
     for path, what in _to_open(result).items() if files else ():
         console.print(Text(f"  {path}"), Text(what, "dim"), soft_wrap=True)
-    for line in _withheld_lines(result, force_with):
+    for line in (*_withheld_lines(result, force_with), *_left_out_lines(result)):
         console.print(Text(f"  {line}", "dim"), soft_wrap=True)
 
 
@@ -112,6 +112,17 @@ def _withheld_lines(result: Registration, force_with: str) -> list[str]:
     possible = result.T_target_source is not None
     hint = f"; {force_with}" if possible else ""
     return [f"not written: {what}, since {result.not_written[missing[0]]}{hint}"]
+
+
+def _left_out_lines(result: Registration) -> list[str]:
+    """Say which points could not be stored."""
+    from mtpcr_geo.export.apply import left_out_text
+
+    return [
+        left_out_text(int(record.metadata["left_out"]), Path(str(record.metadata["filename"])).name)
+        for record in result.report
+        if record.metadata.get("left_out")
+    ]
 
 
 def _stdout() -> Console:

@@ -11,6 +11,7 @@ import numpy as np
 
 from mtpcr_geo.core.arrays import ComparesArrays, Floats
 from mtpcr_geo.core.errors import CrsError
+from mtpcr_geo.core.scanner import PLAIN, Scanner, rotation_of
 
 if TYPE_CHECKING:
     from pyproj import CRS, Transformer
@@ -83,8 +84,8 @@ class OperationReport:
 class FrameLink(ComparesArrays):
     """The conversion between a file's coordinates and work coordinates of its side.
 
-    File coordinates go through a PROJ pipeline where the CRSs differ, are multiplied by a factor where
-    the units do, and are shifted by the origin.
+    File coordinates go through a PROJ pipeline where the CRSs differ, are turned by quarters where another
+    axis is up, are multiplied by a factor where the units differ, and are shifted by the origin.
 
     Attributes:
         file_crs: the CRS of the file's coordinates, or None for local.
@@ -95,6 +96,7 @@ class FrameLink(ComparesArrays):
         report: the operation by name, its accuracy and grids, and what had to be assumed.
         georeferenced: whether the file's CRS is tied to the earth, so that its vertical and its place are
             known. False for local coordinates, and for an engineering CRS, which has a name but no place.
+        scanner: unit and axes that are declared for local coordinates; the unit is in `factor` already.
 
     """
 
@@ -105,6 +107,11 @@ class FrameLink(ComparesArrays):
     bounds: Floats | None = None
     report: OperationReport = field(default_factory=OperationReport)
     georeferenced: bool = False
+    scanner: Scanner = PLAIN
+
+    def metric(self, xyz: Floats) -> Floats:
+        """Take (n, 3) coordinates, past the pipeline, to metres with z up, not shifted."""
+        return np.asarray(self._turned(xyz) * self.factor)
 
     def to_work(self, xyz: Floats) -> Floats:
         """Take (n, 3) file coordinates to (n, 3) work coordinates in metres.
@@ -116,7 +123,7 @@ class FrameLink(ComparesArrays):
         xyz = np.asarray(xyz, np.float64)
         if self.pipeline is not None:
             xyz = run_pipeline(self.pipeline, xyz)
-        return np.asarray(xyz * self.factor - self.origin)
+        return np.asarray(self.metric(xyz) - self.origin)
 
     def to_file(self, xyz: Floats) -> Floats:
         """Take (n, 3) work coordinates in metres to (n, 3) file coordinates.
@@ -126,9 +133,14 @@ class FrameLink(ComparesArrays):
 
         """
         xyz = (np.asarray(xyz, np.float64) + self.origin) / self.factor
+        if self.scanner.axes != "z-up":
+            xyz = xyz @ rotation_of(self.scanner.axes)
         if self.pipeline is not None:
             xyz = run_pipeline(self.pipeline, xyz, inverse=True)
         return np.asarray(xyz)
+
+    def _turned(self, xyz: Floats) -> Floats:
+        return xyz if self.scanner.axes == "z-up" else xyz @ rotation_of(self.scanner.axes).T
 
     @property
     def T_work_file(self) -> Floats:
@@ -139,8 +151,9 @@ class FrameLink(ComparesArrays):
     def T_file_work(self) -> Floats:
         """4x4 from work to file coordinates; with a pipeline, the best fit within the bounds."""
         if self.pipeline is None:
-            T = np.diag([*(1.0 / self.factor), 1.0])
-            T[:3, 3] = self.origin / self.factor
+            T = np.eye(4)
+            T[:3, :3] = rotation_of(self.scanner.axes).T / self.factor
+            T[:3, 3] = rotation_of(self.scanner.axes).T @ (self.origin / self.factor)
             return T
         return np.asarray(np.linalg.inv(self._fit[0]))
 
@@ -152,7 +165,8 @@ class FrameLink(ComparesArrays):
     @cached_property
     def _fit(self) -> tuple[Floats, float]:
         if self.pipeline is None:
-            T = np.diag([*self.factor, 1.0])
+            T = np.eye(4)
+            T[:3, :3] = rotation_of(self.scanner.axes) * self.factor[:, None]
             T[:3, 3] = -self.origin
             return T, 0.0
         if self.bounds is None:

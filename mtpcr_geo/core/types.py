@@ -149,6 +149,9 @@ class Side(ComparesArrays):
             header's.
         no_returns: points that mark beams without a return: kept in what is written, and in nothing else.
         no_return_places: (k, 3) file coordinates where these are.
+        strays: points that lie far from all others, likewise.
+        box: (2, 3) file coordinates beyond which these lie; None where there are none.
+        remarks: what the points say otherwise than the header of the file, a sentence each.
 
     """
 
@@ -163,6 +166,9 @@ class Side(ComparesArrays):
     bounds: Floats | None = None
     no_returns: int = 0
     no_return_places: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    strays: int = 0
+    box: Floats | None = None
+    remarks: tuple[str, ...] = ()
 
     @property
     def T_level_work(self) -> Floats:

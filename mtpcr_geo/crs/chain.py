@@ -52,7 +52,9 @@ class TransformChain(ComparesArrays):
             target=pair.frame.output or pair.target.link,
             T_target_source=np.asarray(pair.T_target_source, np.float64),
             pivot=link.to_file(centre[None])[0],
-            bounds=np.stack([cloud.minimum, cloud.maximum]).astype(np.float64),
+            bounds=np.stack([cloud.minimum, cloud.maximum]).astype(np.float64)
+            if pair.source.bounds is None
+            else pair.source.bounds,
         )
 
     def forward(self, xyz: Floats) -> Floats:

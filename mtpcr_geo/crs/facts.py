@@ -8,9 +8,14 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
 from mtpcr_geo.core.errors import CrsError
+from mtpcr_geo.core.scanner import PLAIN, Scanner
 
 if TYPE_CHECKING:
     from pyproj import CRS
+
+# what stands for a vertical datum where none is known, in letters alone
+_NO_NAMES = {"", "unknown", "unnamed", "undefined", "notspecified", "notspecifiedbasedonunspecifiedellipsoid"}
+_NOT_SPECIFIED = "notspecified"
 
 Kind = Literal["projected", "geographic", "geocentric", "local"]
 Height = Literal["datum", "ellipsoidal", "unsaid"]
@@ -30,6 +35,8 @@ class CrsFacts:
         vertical: the vertical CRS where there is one.
         height_unit: metres a unit of height.
         height_unit_name: of the unit of height.
+        height_unit_stated: whether the CRS states that unit, and it is not taken from the plan.
+        scanner: unit and axes declared for local coordinates.
 
     """
 
@@ -42,6 +49,8 @@ class CrsFacts:
     vertical: CRS | None
     height_unit: float
     height_unit_name: str
+    height_unit_stated: bool = True
+    scanner: Scanner = PLAIN
 
     @property
     def name(self) -> str:
@@ -63,15 +72,20 @@ class CrsFacts:
         return "heights of no stated datum"
 
 
-def facts_of(crs: CRS | None) -> CrsFacts:
-    """Take a CRS apart; None means local metres.
+def facts_of(crs: CRS | None, scanner: Scanner = PLAIN) -> CrsFacts:
+    """Take a CRS apart; None means local coordinates.
+
+    Args:
+        crs: the CRS.
+        scanner: unit and axes of local coordinates; metres and z up if nothing is declared.
 
     Raises:
         CrsError: if it is of a kind, or has axes, that cannot be handled.
 
     """
     if crs is None:
-        return CrsFacts(None, "local", None, 1.0, "metre", "unsaid", None, 1.0, "metre")
+        unit, name = scanner.metres, scanner.unit_name
+        return CrsFacts(None, "local", None, unit, name, "unsaid", None, unit, name, True, scanner)
     horizontal, vertical = _parts(crs)
     plain = unbound(horizontal)
     axes = plain.axis_info
@@ -100,11 +114,16 @@ def facts_of(crs: CRS | None) -> CrsFacts:
         unit *= 180.0 / 3.141592653589793
     height: Height = "unsaid"
     height_unit, height_unit_name = (1.0, "metre") if kind == "geographic" else (unit, unit_name)
+    unit_stated = vertical is not None or len(axes) == 3
     if vertical is not None:
         axis = unbound(vertical).axis_info[0]
         if axis.direction.lower() != "up":
             raise CrsError(f"{vertical.name} counts {axis.direction}, not up; reproject the heights first")
-        height, height_unit, height_unit_name = "datum", _factor(axis), axis.unit_name
+        height_unit, height_unit_name = _factor(axis), axis.unit_name
+        if _is_nameless(vertical):
+            vertical = None  # it states a unit, and no datum
+        else:
+            height = "datum"
     elif len(axes) == 3:
         height = "unsaid" if kind == "local" else "ellipsoidal"
         height_unit, height_unit_name = _factor(axes[2]), axes[2].unit_name
@@ -120,7 +139,15 @@ def facts_of(crs: CRS | None) -> CrsFacts:
         vertical=vertical,
         height_unit=height_unit,
         height_unit_name=height_unit_name,
+        height_unit_stated=unit_stated,
     )
+
+
+def _is_nameless(vertical: CRS) -> bool:
+    """Return whether a vertical CRS has a datum that is none, put where the unit alone was known."""
+    datum = unbound(vertical).datum
+    name = _letters("" if datum is None else datum.name)
+    return name in _NO_NAMES or (name.startswith(_NOT_SPECIFIED) and not vertical.name.strip())
 
 
 def unbound(crs: CRS) -> CRS:

@@ -10,6 +10,7 @@ import numpy as np
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError, InputError
 from mtpcr_geo.core.frames import FrameLink, OperationReport, Vertical, WorkFrame, box_points, run_pipeline
+from mtpcr_geo.core.scanner import PLAIN, Scanner
 from mtpcr_geo.crs.facts import CrsFacts, facts_of, metric, same_datum, same_heights, same_place, unbound
 from mtpcr_geo.crs.operation import area_of, best_operation, grid_scale, local_projection
 
@@ -55,6 +56,10 @@ def resolve_frames(
     local: bool = False,
     vertical: Vertical = "refuse",
     out_crs: str | CRS | None = None,
+    target_bounds: Floats | None = None,
+    source_bounds: Floats | None = None,
+    target_scanner: Scanner = PLAIN,
+    source_scanner: Scanner = PLAIN,
 ) -> tuple[WorkFrame, FrameLink, FrameLink]:
     """Return the frame in which two clouds are registered, and how each is converted to it.
 
@@ -72,6 +77,11 @@ def resolve_frames(
         vertical: what to do where heights have different or unknown datums: "refuse"; "assume-same" takes
             them as equal; "estimate" takes them as they are and leaves the offset to the registration.
         out_crs: CRS of the result where that is not the target's.
+        target_bounds: (2, 3) least and greatest coordinates of the target's points, where they are known;
+            what its header states if None.
+        source_bounds: the same of the source.
+        target_scanner: unit and axes of the target, where it is local.
+        source_scanner: the same of the source.
 
     Returns:
         The work frame (with the way out to `out_crs` as its `output`), the target's and the source's link.
@@ -81,9 +91,12 @@ def resolve_frames(
         InputError: if the bounds make no sense.
 
     """
-    target_facts = facts_of(None if local else _claimed(target, target_crs, "target"))
-    source_facts = facts_of(None if local else _claimed(source, source_crs, "source"))
-    target_bounds, source_bounds = _bounds(target), _bounds(source)
+    target_facts = facts_of(None if local else _claimed(target, target_crs, "target"), target_scanner)
+    source_facts = facts_of(None if local else _claimed(source, source_crs, "source"), source_scanner)
+    _require_local(target_facts, target_scanner, "target")
+    _require_local(source_facts, source_scanner, "source")
+    target_bounds = _bounds(target) if target_bounds is None else target_bounds
+    source_bounds = _bounds(source) if source_bounds is None else source_bounds
 
     work = _work_crs(target_facts, target_bounds)
     target_link = _link(target_facts, work, target_facts, target_bounds, "assume-same")
@@ -100,6 +113,21 @@ def resolve_frames(
     if out_crs is not None:
         frame = replace(frame, output=_output(out_crs, frame, target_link, target_facts, vertical))
     return frame, target_link, source_link
+
+
+def _require_local(facts: CrsFacts, scanner: Scanner, role: str) -> None:
+    """Refuse a unit or axes for a cloud whose CRS states both.
+
+    Raises:
+        CrsError: naming the option.
+
+    """
+    for option, given in (("unit", scanner.unit is not None), ("axes", scanner.axes != "z-up")):
+        if given and facts.crs is not None:
+            raise CrsError(
+                f"--{role}-{option} is for local coordinates, and the {role} is in {facts.name}, which "
+                f"states its own; give --{role}-crs local too, if that does not hold"
+            )
 
 
 def _claimed(cloud: Cloud, declared: str | CRS | None, role: str) -> CRS | None:
@@ -165,7 +193,9 @@ def _link(
         height_notes=tuple(height_notes),
         unit_notes=_unit_notes(facts),
     )
-    link = FrameLink(facts.crs, np.zeros(3), factor, pipeline, bounds, report, facts.georeferenced)
+    link = FrameLink(
+        facts.crs, np.zeros(3), factor, pipeline, bounds, report, facts.georeferenced, facts.scanner
+    )
     return replace(link, origin=_origin(link, bounds))
 
 
@@ -207,16 +237,13 @@ def _heights_agree(facts: CrsFacts, other: CrsFacts, vertical: Vertical, notes: 
 
 
 def _unit_notes(facts: CrsFacts) -> tuple[str, ...]:
-    if facts.height != "unsaid" or not facts.georeferenced:
+    if facts.height != "unsaid" or facts.height_unit_stated or not facts.georeferenced:
         return ()
     return (f"the CRS states no unit of height: taken as {facts.height_unit_name}",)
 
 
 def _origin(link: FrameLink, bounds: Floats) -> Floats:
-    if link.pipeline is None:
-        corners = np.asarray(bounds * link.factor)
-    else:
-        corners = link.to_work(box_points(bounds, 3))
+    corners = link.metric(bounds) if link.pipeline is None else link.to_work(box_points(bounds, 3))
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     # the odd fraction keeps bounds on a decimal grid off the rounding edge, where a far shift could flip it
     return np.asarray(np.floor(middle + 0.123456))

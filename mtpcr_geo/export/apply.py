@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,11 +11,12 @@ import numpy as np
 from mtpcr_geo.core.errors import CrsError, InputError, OutputError
 from mtpcr_geo.crs.facts import same_place
 from mtpcr_geo.export.transform import read_transform
-from mtpcr_geo.io.las import open_cloud
+from mtpcr_geo.io.formats import open_any
+from mtpcr_geo.io.many import ManyFiles, output_names
 from mtpcr_geo.io.memory import cloud_of, coordinates, is_array
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.io.views import Moved
-from mtpcr_geo.io.write import returning_scales, write_cloud
+from mtpcr_geo.io.write import write_cloud
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.arrays import Floats
@@ -36,6 +37,7 @@ def apply_transform(
     inverse: bool = False,
     overwrite: bool = False,
     progress: Progress | None = None,
+    say: Callable[[str], object] | None = None,
 ) -> Path:
     """Stream a cloud through a transform into a new LAS, LAZ or COPC file.
 
@@ -44,10 +46,12 @@ def apply_transform(
     Args:
         transform_path: a ``transform.json``.
         in_path: a cloud in the source's frame (in the target's with `inverse`).
-        out_path: where to write; the suffix is the format.
+        out_path: where to write; the suffix is the format. For a cloud of many files a folder, which will
+            hold a file of the same name for each.
         inverse: go from target to source.
         overwrite: whether `out_path` may be replaced.
         progress: where to report the points written.
+        say: called with a sentence where points were left out.
 
     Returns:
         The file written.
@@ -59,13 +63,24 @@ def apply_transform(
 
     """
     chain = read_transform(transform_path)
-    cloud = open_cloud(in_path)
+    cloud = open_any(in_path)
     out_path = Path(out_path)
-    for read in (Path(in_path), Path(transform_path)):
-        if out_path.exists() and out_path.samefile(read):
+    for read in (cloud.path, Path(in_path), Path(transform_path)):
+        if out_path.exists() and read.is_file() and out_path.samefile(read):
             raise InputError(f"{out_path} is input and output at once; write to another file")
-    write_moved(out_path, moved_by(chain, cloud, inverse=inverse), overwrite=overwrite, progress=progress)
+    moved = moved_by(chain, cloud, inverse=inverse)
+    left_out = write_moved(
+        out_path, moved, overwrite=overwrite, reads=(in_path, transform_path), progress=progress
+    )
+    if left_out and say is not None:
+        say(left_out_text(left_out, out_path.name))
     return out_path
+
+
+def left_out_text(count: int, name: str) -> str:
+    """Return in a sentence that points were left out of a file."""
+    points = "1 point is" if count == 1 else f"{count:,} points are"
+    return f"{points} left out of {name}: too far from all others to be stored with them"
 
 
 def move(chain: TransformChain, points: CloudLike, *, inverse: bool = False) -> Floats | Cloud:
@@ -146,6 +161,12 @@ def _check_near(chain: TransformChain, cloud: Cloud, inverse: bool) -> None:
         )
 
 
+def paths_of(cloud: Cloud) -> list[Path]:
+    """Return the files that a cloud is read from; none for a cloud in memory."""
+    clouds = cloud.parts if isinstance(cloud, ManyFiles) else (cloud,)
+    return [path for path in (getattr(one, "path", None) for one in clouds) if isinstance(path, Path)]
+
+
 def write_moved(
     out_path: Path,
     moved: Moved,
@@ -153,33 +174,40 @@ def write_moved(
     overwrite: bool = False,
     reads: Iterable[str | Path] = (),
     progress: Progress | None = None,
-) -> None:
+) -> int:
     """Stream a moved cloud into a new LAS, LAZ or COPC file, with digits fine enough to move it back.
 
     Args:
-        out_path: where to write; the suffix is the format.
+        out_path: where to write; the suffix is the format. For a cloud of many files a folder.
         moved: what to write.
         overwrite: whether `out_path` may be replaced.
         reads: files that are read, and never replaced.
         progress: where to report the points written.
 
+    Returns:
+        The number of points left out, since they lie too far from all others to be stored with them.
+
     Raises:
         OutputError: if the output cannot be written, or exists, or its ending names no format.
 
     """
-    if out_path.suffix.lower() not in _ENDINGS:
+    parts: list[tuple[Path, Cloud]] = [(out_path, moved.base)]
+    if isinstance(moved.base, ManyFiles):
+        clouds = moved.base.parts
+        names = output_names([Path(part.name) for part in clouds])
+        parts = [(out_path / name, part) for name, part in zip(names, clouds, strict=True)]
+        if out_path.is_file():
+            raise InputError(f"{out_path} is a file, and {len(parts)} files are moved; name a folder")
+    elif out_path.suffix.lower() not in _ENDINGS:
         raise OutputError(
             f"{out_path} ends in none of {', '.join(_ENDINGS)} and .copc.laz, which are the formats written; "
             "name such a file"
         )
     with OutputSet(overwrite) as outputs:
-        outputs.keep(Path(file) for file in reads)
-        write_cloud(
-            outputs.path(out_path),
-            moved.base,
-            moved.move,
-            moved.crs,
-            scale=tuple(returning_scales(moved.base, moved.crs)),
-            progress=progress,
+        outputs.keep([*(Path(file) for file in reads), *paths_of(moved.base)])
+        left_out = sum(
+            write_cloud(outputs.path(final), part, moved.move, moved.crs, progress=progress, returning=True)
+            for final, part in parts
         )
         outputs.commit()
+    return left_out

@@ -14,7 +14,7 @@ from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.types import IcpResult, Pair, Side, Verdict
 from mtpcr_geo.crs import FrameLink, TransformChain, facts_of
 from mtpcr_geo.export.tie_points import tie_positions
-from mtpcr_geo.export.transform import units_of
+from mtpcr_geo.export.transform import cloudcompare_of, units_of
 
 Row = tuple[str, str]
 
@@ -95,6 +95,8 @@ def side_rows(side: Side) -> list[Row]:
         ("file", Path(cloud.name).name),
         ("points", f"{cloud.count:,}"),
         *_no_return_rows(side),
+        *_stray_rows(side),
+        *(("header", remark) for remark in side.remarks),
         ("CRS", crs),
         ("units", units_text(side.link)),
         *_operation_rows(side.link),
@@ -119,6 +121,13 @@ def _no_return_rows(side: Side) -> list[Row]:
     return [("points without a return", text)]
 
 
+def _stray_rows(side: Side) -> list[Row]:
+    if not side.strays:
+        return []
+    text = f"{side.strays:,}, far from all others: kept in what is written, left out of all else"
+    return [("stray points", text)]
+
+
 def transform_rows(pair: Pair) -> list[Row]:
     """Return what the transform does: yaw, tilt, shift of the source's middle, residuals of tie points."""
     if pair.T_target_source is None:
@@ -131,7 +140,19 @@ def transform_rows(pair: Pair) -> list[Row]:
     if moved:
         rows.append(("shift of the source's middle", moved))
     rows.append(("result in", result_text(pair)))
-    offset = TransformChain.of(pair).vertical_offset_m
+    chain = TransformChain.of(pair)
+    shifts = {
+        role: ", ".join(f"{value + 0.0:.10g}" for value in cloudcompare_of(chain)[f"{role}_global_shift"])
+        for role in ("source", "target")
+    }
+    rows.append(
+        (
+            "in CloudCompare",
+            f"global shift of the source ({shifts['source']}), of the target ({shifts['target']}): "
+            "transform.cloudcompare.txt holds with these",
+        )
+    )
+    offset = chain.vertical_offset_m
     if offset is not None:
         rows.append(("height offset found", f"{offset:+.3f} m, added to the source's heights"))
     if pair.tie_points is not None and len(pair.tie_points.target):
@@ -167,7 +188,8 @@ def units_text(link: FrameLink) -> str:
     """Return the units of a file's coordinates, in plan and height, and what its heights refer to."""
     across, _, up = units_of(link)
     units = across if across == up else f"{across} in plan, {up} in height"
-    return f"{units}; {facts_of(link.file_crs).height_name}"
+    axes = "" if link.scanner.axes == "z-up" else f"; {link.scanner.axes}"
+    return f"{units}; {facts_of(link.file_crs).height_name}{axes}"
 
 
 def shift_text(pair: Pair) -> str:
@@ -181,7 +203,7 @@ def shift_text(pair: Pair) -> str:
         return f"{_numbers(shift, 3, sign=True)} m (east, north, up in {pair.frame.crs.name})"
     if not (pair.source.link.georeferenced or pair.target.link.georeferenced):
         moved = chain.forward(chain.pivot[None])[0]
-        shift = moved * chain.target.factor - chain.pivot * chain.source.factor
+        shift = chain.target.metric(moved) - chain.source.metric(chain.pivot)
         return f"{_numbers(shift, 3, sign=True)} m (x, y, z)"
     return ""
 

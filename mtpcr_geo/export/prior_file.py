@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.crs.chain import TransformChain
@@ -24,7 +26,8 @@ def read_pose(path: Path) -> TransformChain | Floats:
     Args:
         path: a ``transform.json``; a ``transform.pdal.json`` of a plain 4x4; JSON with four rows of four
             numbers, sixteen numbers, or an object that has them under one of `MATRIX_KEYS`; or text with
-            four rows of four numbers, as CloudCompare writes them.
+            four rows of four numbers, as CloudCompare writes them; a ``transform.cloudcompare.txt`` with
+            the global shifts that it states.
 
     Returns:
         The chain of a ``transform.json``; else a 4x4.
@@ -46,7 +49,15 @@ def read_pose(path: Path) -> TransformChain | Floats:
         numbers = [[float(word) for word in line] for line in lines if line]
     except ValueError as error:
         raise InputError(f"{path} is no 4x4 ({error}); {_ROWS}") from error
-    return matrix_of(numbers, str(path))
+    T = matrix_of(numbers, str(path))
+    shifts = [_shift(text, role) for role in ("source", "target")]
+    return np.asarray(transforms.translation(-shifts[1]) @ T @ transforms.translation(shifts[0]))
+
+
+def _shift(text: str, role: str) -> Floats:
+    """Return the global shift that a matrix for CloudCompare states, (3,); zeros if it states none."""
+    found = re.search(rf"^# {role} global shift: (\S+) (\S+) (\S+)$", text, re.M)
+    return np.zeros(3) if found is None else np.array([float(one) for one in found.groups()])
 
 
 def matrix_of(value: Any, name: str) -> Floats:

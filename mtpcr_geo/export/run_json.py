@@ -100,6 +100,10 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.level <role>.points``: points read
 - ``mtpcr.level <role>.noise_points``: of these, classified as noise (7, 18) or flagged withheld, and left
   out
+- ``mtpcr.level <role>.stray_points``: points that lie far from all others: kept in what is written, left
+  out of everything else
+- ``mtpcr.level <role>.header_remarks``: what the points say otherwise than the header of the file, a
+  sentence each; only where there is something
 - ``mtpcr.level <role>.no_return_points``: points that mark beams without a return, all on exactly one place:
   kept in what is written, left out of everything else
 - ``mtpcr.level <role>.sampled``: points kept to work on

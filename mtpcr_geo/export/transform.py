@@ -14,6 +14,8 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.core.frames import FrameLink, OperationReport, Vertical
+from mtpcr_geo.core.scanner import Scanner
+from mtpcr_geo.core.units import Axes, Unit
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.crs.facts import facts_of
 
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 
     from mtpcr_geo.core.types import Pair
 
-KIND, VERSION = "mtpcr-geo transform", 1
+KIND, VERSION, TURNED = "mtpcr-geo transform", 1, 2
 _SHARED_SHIFT = 10_000.0  # beyond this, single precision would show in one common shift
 _EARTH_RADIUS = 6_371_000.0
 
@@ -47,7 +49,8 @@ def write_transform_json(path: str | Path, pair: Pair, *, forced: bool = False) 
     moved = chain.forward(examples)
     document: dict[str, Any] = {
         "type": KIND,
-        "version": VERSION,
+        # programs that know no axes shall not take such a file for another
+        "version": VERSION if chain.source.scanner.axes == chain.target.scanner.axes == "z-up" else TURNED,
         "T_target_source": T,
         "T_source_target": np.linalg.inv(T) if not _is_rigid(T) else transforms.inverse(T),
         "verdict": _verdict(pair, forced),
@@ -88,57 +91,25 @@ def write_transform_json(path: str | Path, pair: Pair, *, forced: bool = False) 
             "by_matrix": transforms.apply(T, examples[:1])[0],
         },
         "more_examples": [{"source": a, "target": b} for a, b in zip(examples[1:], moved[1:], strict=True)],
-        "cloudcompare": {key: value for key, value in _cloudcompare(chain).items() if key != "matrix"},
+        "cloudcompare": {key: value for key, value in cloudcompare_of(chain).items() if key != "matrix"},
         "files": {"source": Path(pair.source.cloud.name).name, "target": Path(pair.target.cloud.name).name},
     }
     Path(path).write_text(dumps(document) + "\n", encoding="utf-8")
 
 
 def write_cloudcompare_matrix(path: str | Path, pair: Pair) -> None:
-    """Write the 4x4 for CloudCompare: four rows of four numbers, and nothing else.
+    """Write the 4x4 for CloudCompare: four rows of four numbers, and behind them how to use it.
 
     CloudCompare holds points in single precision, less a global shift. The matrix acts on points loaded
-    with the shifts that ``transform.json`` names under ``cloudcompare``.
+    with the shifts that stand below it, and in ``transform.json`` under ``cloudcompare``. Of a text file
+    CloudCompare reads the first four lines.
     """
-    rows = _cloudcompare(TransformChain.of(pair))["matrix"]
-    text = "\n".join(" ".join(f"{value:.17g}" for value in row) for row in rows)
-    Path(path).write_text(text + "\n", encoding="utf-8")
-
-
-def write_pdal_pipeline(path: str | Path, pair: Pair) -> None:
-    """Write a PDAL pipeline that moves the source file as the chain does, and writes LAS 1.4."""
-    chain = TransformChain.of(pair)
-    source_name = pair.source.cloud.name
-    stages: list[Any] = [source_name]
-    if chain.is_affine:
-        stages.append({"type": "filters.transformation", "matrix": _row_major(chain.T_file)})
-    else:
-        inner = transforms.translation(chain.target.origin) @ chain.T_target_source
-        stages += _pdal_link(chain.source, inverse=False)
-        stages.append(
-            {
-                "type": "filters.transformation",
-                "matrix": _row_major(inner @ transforms.translation(-chain.source.origin)),
-            }
-        )
-        stages += _pdal_link(chain.target, inverse=True)
-    writer: dict[str, Any] = {
-        "type": "writers.las",
-        "filename": f"{Path(source_name).stem}_registered.laz",
-        "minor_version": 4,
-        "forward": "vlr,global_encoding",
-        "extra_dims": "all",
-        "offset_x": "auto",
-        "offset_y": "auto",
-        "offset_z": "auto",
-        "compression": True,
-    }
-    step = 1e-9 if chain.target.file_crs is not None and chain.target.file_crs.is_geographic else 0.001
-    writer |= {"scale_x": step, "scale_y": step, "scale_z": 0.001}
-    if chain.target.file_crs is not None:
-        writer["a_srs"] = chain.target.file_crs.to_wkt()
-    stages.append(writer)
-    Path(path).write_text(dumps({"pipeline": stages}) + "\n", encoding="utf-8")
+    found = cloudcompare_of(TransformChain.of(pair))
+    rows = [" ".join(f"{value:.17g}" for value in row) for row in found["matrix"]]
+    for role in ("source", "target"):
+        shift = " ".join(f"{value + 0.0:.17g}" for value in found[f"{role}_global_shift"])
+        rows.append(f"# {role} global shift: {shift}")
+    Path(path).write_text("\n".join([*rows, f"# {found['note']}"]) + "\n", encoding="utf-8")
 
 
 def read_transform(path: str | Path) -> TransformChain:
@@ -159,9 +130,9 @@ def read_transform(path: str | Path) -> TransformChain:
         raise InputError(f"{path} is not JSON ({error}); name a transform.json") from error
     if not isinstance(document, dict) or document.get("type") != KIND:
         raise InputError(f"{path} is not a transform that this program wrote; name a transform.json")
-    if document.get("version") != VERSION:
+    if document.get("version") not in (VERSION, TURNED):
         raise InputError(
-            f"{path} is a transform of version {document.get('version')}, and this program reads {VERSION}; "
+            f"{path} is a transform of version {document.get('version')}, and this program reads {TURNED}; "
             "update it, or register again"
         )
     try:
@@ -280,7 +251,7 @@ def _motion(chain: TransformChain) -> dict[str, Any]:
 
 def units_of(link: FrameLink) -> list[str]:
     """Return the units of x, y and z in a file."""
-    facts = facts_of(link.file_crs)
+    facts = facts_of(link.file_crs, link.scanner)
     return [facts.unit_name, facts.unit_name, facts.height_unit_name]
 
 
@@ -295,8 +266,11 @@ def _crs(crs: CRS | None, wkt: bool = True) -> dict[str, Any] | None:
 def _link(link: FrameLink) -> dict[str, Any]:
     return {
         "crs": _crs(link.file_crs),
-        "steps": "work = factor * pipeline(file) - origin, element by element; no pipeline means file itself",
+        "steps": "work = factor * turned(pipeline(file)) - origin, element by element; no pipeline means "
+        "file itself, turned takes the axes to z up: of y-up (x, -z, y), of z-down (x, -y, -z)",
         "pipeline": link.pipeline,
+        "axes": link.scanner.axes,
+        "unit": link.scanner.unit,
         "factor": link.factor,
         "origin": link.origin,
         "bounds": link.bounds,
@@ -325,7 +299,17 @@ def _read_link(data: Mapping[str, Any]) -> FrameLink:
         bounds=None if data["bounds"] is None else _array(data["bounds"], (2, 3)),
         report=_read_report(data["report"]),
         georeferenced=facts_of(crs).georeferenced,
+        scanner=_read_scanner(data),
     )
+
+
+def _read_scanner(data: Mapping[str, Any]) -> Scanner:
+    # older files have neither
+    axes: Axes | None = next((one for one in get_args(Axes) if one == data.get("axes", "z-up")), None)
+    unit: Unit | None = next((one for one in get_args(Unit) if one == data.get("unit")), None)
+    if axes is None:
+        raise ValueError(f"axes are {data.get('axes')!r}")
+    return Scanner(unit, axes)
 
 
 def _read_report(data: Mapping[str, Any]) -> OperationReport:
@@ -351,8 +335,8 @@ def _array(value: Any, shape: tuple[int, ...]) -> Floats:
     return array
 
 
-def _cloudcompare(chain: TransformChain) -> dict[str, Any]:
-    """Return the matrix on shifted coordinates, and the shifts with which it holds."""
+def cloudcompare_of(chain: TransformChain) -> dict[str, Any]:
+    """Return the matrix for CloudCompare, on shifted coordinates, and the shifts with which it holds."""
     source, target = _file_origin(chain.source), _file_origin(chain.target)
     if np.abs(source - target).max() < _SHARED_SHIFT:
         source = target
@@ -374,21 +358,3 @@ def _cloudcompare(chain: TransformChain) -> dict[str, Any]:
 def _file_origin(link: FrameLink) -> Floats:
     """Return whole file units near the link's origin."""
     return np.asarray(np.rint(link.to_file(np.zeros((1, 3)))[0]))
-
-
-def _row_major(T: Floats) -> str:
-    return " ".join(f"{value:.17g}" for value in T.ravel())
-
-
-def _pdal_link(link: FrameLink, inverse: bool) -> list[dict[str, Any]]:
-    """Return the PDAL stages from file to unshifted work coordinates, or back."""
-    stages: list[dict[str, Any]] = []
-    if link.pipeline is not None:
-        stages.append({"type": "filters.projpipeline", "coord_op": link.pipeline})
-        if inverse:
-            stages[0]["reverse_transfo"] = True
-    if (link.factor != 1.0).any():
-        factor = 1.0 / link.factor if inverse else link.factor
-        scale = {"type": "filters.transformation", "matrix": _row_major(np.diag([*factor, 1.0]))}
-        stages.insert(0 if inverse else len(stages), scale)
-    return stages

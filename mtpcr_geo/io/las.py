@@ -6,8 +6,9 @@ import logging
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import laspy
 import lazrs
@@ -19,7 +20,8 @@ from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.core.system import sha256
 from mtpcr_geo.io.dimensions import las_table, noise_of_record
-from mtpcr_geo.io.vlr import Record, crs_of_records, read_records
+from mtpcr_geo.io.las_header import Head, Overlaid
+from mtpcr_geo.io.vlr import crs_of_records
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -36,7 +38,9 @@ _BROKEN = (
     KeyError,
     AssertionError,
 )
-_CHUNK_MOST = 10_000_000  # points that a chunk may promise beyond those of the file
+# What they raise on files that are sound, but of a kind that they do not know.
+_UNKNOWN_KIND = (laspy.errors.PointFormatNotSupported, laspy.errors.FileVersionNotSupported)
+_UNKNOWN_WORDS = ("not supported", "unsupported", "is unknown", "is not valid")
 _XYZ = Fields.XY_RETURNS_CHANNEL | Fields.Z
 _XYZ_AND_CLASS = _XYZ | Fields.CLASSIFICATION | Fields.FLAGS
 
@@ -50,23 +54,29 @@ class LasCloud(Cloud):
     Attributes:
         path: the file.
         header: laspy's header (point format, scales, offsets, bounds, identifiers).
+        point_format: laspy's, with the extra dimensions.
+        extra: the extra dimensions, as they are written again.
         records: its variable length records, before and behind the points, byte for byte.
-        crs_problem: why `crs` is None though the file states one, or "".
+        stated_count: number of points by its header, where `count` is what there are.
+        crs_problem: what cannot be used of the CRS that the file states, or "".
 
     """
 
-    def __init__(
-        self, path: Path, header: laspy.LasHeader, records: list[Record], crs: CRS | None = None
-    ) -> None:
+    def __init__(self, path: Path, head: Head, crs: CRS | None = None) -> None:
+        header = head.header
         self.path = path
         self.name = str(path)
         self.header = header
-        self.records = records
+        self.point_format = head.point_format
+        self.extra = head.extra
+        self.records = head.records
+        self.stated_count = head.stated_count
         self.crs_problem = ""
         self.crs = crs
         if crs is None:
-            self.crs, self.crs_problem = crs_of_records(records)
-        self.count = int(header.point_count)
+            self.crs, self.crs_problem = crs_of_records(head.records)
+        self.count = head.count
+        self._head = head.raw
         self.minimum = np.array(header.mins, np.float64)
         self.maximum = np.array(header.maxs, np.float64)
 
@@ -83,14 +93,10 @@ class LasCloud(Cloud):
             InputError: if the file is truncated or damaged.
 
         """
-        chosen = Fields.all() if fields is None else fields
-        with (
-            _reported(self.path),
-            laspy.open(self.path, read_evlrs=False, decompression_selection=chosen) as reader,
-        ):
+        with self._points(fields) as reader:
             left = self.count
             while left:
-                record = reader.read_points(min(size, left))
+                record = self._record(reader.read_points(min(size, left)))
                 if not len(record):
                     raise ValueError(f"{left} of {self.count} points are missing")
                 left -= len(record)
@@ -110,14 +116,28 @@ class LasCloud(Cloud):
             InputError: if the file is truncated or damaged.
 
         """
-        chosen = Fields.all() if fields is None else fields
-        with (
-            _reported(self.path),
-            laspy.open(self.path, read_evlrs=False, decompression_selection=chosen) as reader,
-        ):
+        with self._points(fields) as reader:
             for place in places:
                 reader.seek(place)
-                yield reader.read_points(min(size, self.count - place))
+                yield self._record(reader.read_points(min(size, self.count - place)))
+
+    @contextmanager
+    def _points(self, fields: Fields | None) -> Iterator[laspy.LasReader]:
+        chosen = Fields.all() if fields is None else fields
+        stream = BufferedReader(Overlaid(self.path, self._head), 1 << 20)
+        with (
+            _reported(self.path),
+            laspy.open(stream, read_evlrs=False, decompression_selection=chosen) as reader,
+        ):
+            reader.header.point_count = self.count
+            yield reader
+
+    def _record(self, record: laspy.ScaleAwarePointRecord) -> laspy.ScaleAwarePointRecord:
+        """Return a record that was read without names of its extra dimensions with them."""
+        if self.point_format.num_extra_bytes == 0:
+            return record
+        named = np.frombuffer(record.array, self.point_format.dtype())
+        return laspy.ScaleAwarePointRecord(named, self.point_format, record.scales, record.offsets)
 
     def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
         """Yield (n, 3) float64 coordinates in the file's CRS and units, n <= size.
@@ -168,82 +188,8 @@ def open_cloud(path: str | Path, crs: CRS | None = None) -> LasCloud:
     with _reported(path), path.open("rb") as stream:
         if stream.read(4) != b"LASF":
             raise InputError(f"{path} is not a LAS, LAZ or COPC file (it does not begin with LASF)")
-        _check_head(stream)
-        stream.seek(0)
-        header = laspy.LasHeader.read_from(stream)
-        records = _records(stream, header)
-        header.point_format.dtype()  # two dimensions of one name show here
-        _check_size(path, header)
-        _check_chunk_table(stream, header, records)
-    return LasCloud(path, header, records, crs)
-
-
-def _check_head(stream: BinaryIO) -> None:
-    """Check the counts at the head of the file before anything is read by them.
-
-    Raises:
-        ValueError: if the file cannot hold what they promise.
-
-    """
-    size = stream.seek(0, 2)
-    stream.seek(94)
-    header_size, points, records = struct.unpack("<HII", stream.read(10))
-    if not 227 <= header_size <= points <= size or records * 54 > points - header_size:
-        raise ValueError("its header contradicts its size")
-
-
-def _records(stream: Any, header: laspy.LasHeader) -> list[Record]:
-    stream.seek(94)
-    header_size, _, count = struct.unpack("<HII", stream.read(10))
-    records = read_records(stream, header_size, count, extended=False)
-    if header.version.minor >= 4 and header.number_of_evlrs:
-        records += read_records(stream, header.start_of_first_evlr, header.number_of_evlrs, extended=True)
-    return records
-
-
-def _check_size(path: Path, header: laspy.LasHeader) -> None:
-    if header.are_points_compressed or not header.point_count:
-        return
-    wanted = header.offset_to_point_data + header.point_count * header.point_format.size
-    if path.stat().st_size < wanted:
-        raise ValueError(f"it holds {path.stat().st_size} bytes where its header promises {wanted}")
-
-
-def _check_chunk_table(stream: BinaryIO, header: laspy.LasHeader, records: list[Record]) -> None:
-    """Check the table of the compressed chunks: lazrs ends the whole process on absurd sizes.
-
-    Raises:
-        ValueError: if the table contradicts the file.
-
-    """
-    if not (header.are_points_compressed and header.point_count):
-        return
-    described = [record.data for record in records if record.user_id == "laszip encoded"]
-    if not described:
-        raise ValueError("the record that describes its compression is missing")
-    vlr = lazrs.LazVlr(described[0])
-    if vlr.item_size() != header.point_format.size:
-        raise ValueError("its points and their compression have different sizes")
-    size = stream.seek(0, 2)
-    start = header.offset_to_point_data
-    stream.seek(start)
-    (table,) = struct.unpack("<q", stream.read(8))
-    if table == -1:
-        stream.seek(size - 8)
-        (table,) = struct.unpack("<q", stream.read(8))
-    if not start + 8 <= table <= size - 8:
-        raise ValueError("the table of its compressed chunks is missing")
-    stream.seek(table + 4)
-    (chunks,) = struct.unpack("<I", stream.read(4))
-    if chunks > table - start:
-        raise ValueError("the table of its compressed chunks makes no sense")
-    stream.seek(start)
-    entries = lazrs.read_chunk_table(stream, vlr)
-    fits = sum(length for _, length in entries) <= table - start
-    # with chunks of one size, the table promises full ones, the last one too
-    promised = [points for points, _ in entries]
-    if not fits or sum(promised) < header.point_count or max(promised) > max(header.point_count, _CHUNK_MOST):
-        raise ValueError("the table of its compressed chunks does not fit its header")
+        head = Head(stream)
+    return LasCloud(path, head, crs)
 
 
 @contextmanager
@@ -266,7 +212,19 @@ def _reported(path: Path) -> Iterator[None]:
 
 def _damaged(path: Path, error: BaseException) -> InputError:
     detail = (str(error).splitlines() or [type(error).__name__])[0]
+    of_library = isinstance(error, laspy.errors.LaspyException | lazrs.LazrsError)
+    if isinstance(error, _UNKNOWN_KIND) or (of_library and any(w in detail.lower() for w in _UNKNOWN_WORDS)):
+        return InputError(
+            f"{path} is of a kind that is not supported here ({detail}); write it as LAS 1.4 or LAZ by the "
+            "program that made it, or by PDAL or LAStools"
+        )
     return InputError(f"{path} is truncated or damaged ({detail}); copy or download it again")
+
+
+def _files(cloud: Cloud) -> list[Path]:
+    """Return the files of a cloud, one or many, resolved; none of a cloud in memory."""
+    parts = getattr(cloud, "parts", None)
+    return [Path(one.name).resolve() for one in (parts or (cloud,)) if hasattr(one, "path")]
 
 
 def check_distinct(target: Cloud, source: Cloud) -> None:
@@ -278,13 +236,19 @@ def check_distinct(target: Cloud, source: Cloud) -> None:
     """
     if target is source:
         raise InputError(f"source and target are the same cloud ({source.name}); give two different ones")
-    if not (isinstance(target, LasCloud) and isinstance(source, LasCloud)):
+    paths = [getattr(cloud, "path", None) for cloud in (target, source)]
+    if not (isinstance(paths[0], Path) and isinstance(paths[1], Path)):
         return
-    if target.path.samefile(source.path):
-        raise InputError(f"source and target are the same file ({source.path}); give two different clouds")
-    same_size = target.path.stat().st_size == source.path.stat().st_size
-    if same_size and sha256(target.path) == sha256(source.path):
+    one, other = paths[0], paths[1]
+    if not (one.is_file() and other.is_file()):
+        twice = set(_files(target)) & set(_files(source))
+        if twice:
+            raise InputError(f"source and target share the file {min(twice)}; give two different clouds")
+        return
+    if one.samefile(other):
+        raise InputError(f"source and target are the same file ({other}); give two different clouds")
+    same_size = one.stat().st_size == other.stat().st_size
+    if same_size and sha256(one) == sha256(other):
         raise InputError(
-            f"source and target hold the same bytes ({source.path} and {target.path}); "
-            "give two different clouds"
+            f"source and target hold the same bytes ({other} and {one}); give two different clouds"
         )

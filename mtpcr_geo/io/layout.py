@@ -17,6 +17,7 @@ from mtpcr_geo.core.cloud import Cloud, PointTable, flags_of_table
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.core.version import __version__
 from mtpcr_geo.io.dimensions import LEGACY_OVERLAP, PDAL_NAMES, SCAN_ANGLE_STEP
+from mtpcr_geo.io.foreign import as_vlr
 from mtpcr_geo.io.las import LasCloud, xyz_of
 from mtpcr_geo.io.vlr import EXTRA_BYTES, WKT_RECORD, Record
 
@@ -94,9 +95,9 @@ def wkt_of(crs: CRS) -> str:
 def _las_layout(cloud: LasCloud) -> tuple[laspy.LasHeader, Iterator[Chunk]]:
     old = cloud.header
     point_format = laspy.PointFormat(MODERN_FORMAT.get(old.point_format.id, old.point_format.id))
-    extra = list(old.point_format.extra_dimensions)
-    point_format.dimensions.extend(extra)
     header = laspy.LasHeader(version="1.4", point_format=point_format)
+    # laspy would describe them by records of its own
+    point_format.dimensions.extend(cloud.point_format.extra_dimensions)
     header.file_source_id = old.file_source_id
     header.uuid = old.uuid
     encoding = header.global_encoding
@@ -104,20 +105,14 @@ def _las_layout(cloud: LasCloud) -> tuple[laspy.LasHeader, Iterator[Chunk]]:
     encoding.synthetic_return_numbers = old.global_encoding.synthetic_return_numbers
     encoding.waveform_data_packets_external = old.global_encoding.waveform_data_packets_external
     header.evlrs = laspy.vlrs.vlrlist.VLRList()
-    for record in cloud.records:
-        if record.is_kept:
-            (header.vlrs if len(record.data) <= _MAX_VLR else header.evlrs).append(_vlr(record))
-    described = [record for record in cloud.records if (record.user_id, record.record_id) == EXTRA_BYTES]
-    if described and extra:
-        # as raw bytes: laspy would drop "no data" values and replace the minima and maxima
-        header.vlrs.extract("ExtraBytesVlr")
-        header.vlrs.append(_vlr(described[0]))
+    # as raw bytes: laspy would drop "no data" values and replace the minima and maxima
+    described = [Record(*EXTRA_BYTES, "", cloud.extra.data)] if cloud.extra.descriptors else []
+    for number, record in enumerate([*cloud.records, *described]):
+        if record in described or (record.is_kept and record.place is None):
+            vlr = as_vlr(record, number)
+            (header.vlrs if len(record.data) <= _MAX_VLR else header.evlrs).append(vlr)
     dtype = point_format.dtype()
     return header, ((xyz_of(record), modern(record, dtype)) for record in cloud.record_chunks())
-
-
-def _vlr(record: Record) -> laspy.VLR:
-    return laspy.VLR(record.user_id, record.record_id, record.description, record.data)
 
 
 def modern(record: Any, dtype: np.dtype[Any]) -> NDArray[Any]:

@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 
 def read(path: str | os.PathLike[str], crs: str | CRS | None = None) -> Cloud:
-    """Open a LAS 1.0-1.4, LAZ or COPC file; only its header is read, points are streamed when asked for.
+    """Open a cloud: LAS, LAZ, COPC, PLY, PCD, text, PTS, PTX, E57 or NPY; points are streamed when asked for.
 
     Args:
         path: the file.
@@ -37,16 +37,16 @@ def read(path: str | os.PathLike[str], crs: str | CRS | None = None) -> Cloud:
 
     """
     from mtpcr_geo.crs import parse_crs
-    from mtpcr_geo.io.las import open_cloud
+    from mtpcr_geo.io.formats import open_any
 
-    return open_cloud(os.fspath(path), parse_crs(crs) if isinstance(crs, str) else crs)
+    return open_any(os.fspath(path), parse_crs(crs) if isinstance(crs, str) else crs)
 
 
 def cloud_of(points: CloudLike, name: str = "the cloud") -> Cloud:
     """Return a cloud of whatever holds points.
 
     Args:
-        points: a LAS, LAZ or COPC file; (n, 3) coordinates, list-like accepted; a structured array with
+        points: a file that `read` takes; (n, 3) coordinates, list-like accepted; a structured array with
             X, Y, Z and further dimensions by PDAL's names; `laspy.LasData`; or a `Cloud`, which is returned
             as it is. Float64 coordinates are not copied.
         name: what messages call it; a file has its path.
@@ -61,9 +61,9 @@ def cloud_of(points: CloudLike, name: str = "the cloud") -> Cloud:
     if isinstance(points, Cloud):
         return points
     if isinstance(points, str | os.PathLike):
-        from mtpcr_geo.io.las import open_cloud
+        from mtpcr_geo.io.formats import open_any
 
-        return open_cloud(os.fspath(points))
+        return open_any(os.fspath(points))
     if is_las_data(points):
         return _cloud_of_las(points, name)
     if isinstance(points, np.ndarray) and points.dtype.names is not None:

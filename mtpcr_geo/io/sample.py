@@ -13,6 +13,7 @@ from mtpcr_geo.core.arrays import ComparesArrays, Floats
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.io.no_returns import NoReturns, without
+from mtpcr_geo.io.strays import beyond, stray_box, within
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.progress import Progress
@@ -30,7 +31,10 @@ class Scan(ComparesArrays):
         dropped: of these, points classified as noise (7, 18) or flagged withheld; not in the sample.
         no_returns: of the others, points that mark beams without a return; not in the sample either.
         no_return_places: (k, 3) file coordinates where these are.
+        strays: of the others, points that lie far from all; not in the sample either.
+        box: (2, 3) file coordinates beyond which these lie; None where there are none.
         minimum, maximum: (3,) true bounds of all other points, in file coordinates.
+        whole: (2, 3) true bounds of all points.
         sample: (n, 3) float64 file coordinates, in file order.
         complete: whether the sample is the whole cloud but for the points left out.
 
@@ -40,10 +44,18 @@ class Scan(ComparesArrays):
     dropped: int
     no_returns: int
     no_return_places: Floats
+    strays: int
+    box: Floats | None
     minimum: Floats
     maximum: Floats
     sample: Floats
     complete: bool
+    whole: Floats
+
+    @property
+    def bounds(self) -> Floats:
+        """(2, 3) true bounds of the points that are no noise, no marks of no return, and no strays."""
+        return np.stack([self.minimum, self.maximum])
 
 
 def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progress | None = None) -> Scan:
@@ -68,6 +80,7 @@ def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progres
     none = NoReturns(seed)
     count, dropped, no_returns, late = 0, 0, 0, False
     minimum, maximum = np.full(3, np.inf), np.full(3, -np.inf)
+    whole = np.stack([minimum, maximum])
     task: Any = nullcontext(lambda n: None)
     if progress is not None:
         task = progress.task(f"reading {cloud.name}", cloud.count)
@@ -75,6 +88,10 @@ def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progres
         for xyz, noise in cloud.noise_chunks():
             _check_finite(cloud, xyz, count)
             count += len(xyz)
+            if len(xyz):
+                whole = np.stack(
+                    [np.minimum(whole[0], xyz.min(axis=0)), np.maximum(whole[1], xyz.max(axis=0))]
+                )
             good = xyz[~noise] if noise.any() else xyz
             dropped += len(xyz) - len(good)
             before = count - len(xyz) > 0
@@ -89,37 +106,95 @@ def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progres
     sample = kept.result()
     if late:  # a place that shows late may have points in what was read before
         sample = without(sample, none.places)
-        minimum, maximum, no_returns = _bounds_again(cloud, none.places, count - dropped)
+        minimum, maximum, no_returns = _bounds_again(cloud, none.places, None, count - dropped)
+    strays, box = 0, stray_box(sample)
+    if box is not None and not beyond(np.stack([minimum, maximum]), box).any():
+        box = None
+    if box is not None:
+        number = count - dropped - no_returns
+        sampled = len(sample) < number
+        sample = within(sample, box)
+        if sampled:
+            minimum, maximum, strays = _bounds_again(cloud, none.places, box, number)
+        else:
+            minimum, maximum, strays = sample.min(axis=0), sample.max(axis=0), number - len(sample)
     _check_usable(cloud, count, dropped, no_returns, minimum, maximum)
     return Scan(
         count,
         dropped,
         no_returns,
         none.places,
+        strays,
+        box,
         minimum,
         maximum,
         sample,
-        complete=len(sample) == count - dropped - no_returns,
+        complete=len(sample) == count - dropped - no_returns - strays,
+        whole=whole,
     )
 
 
-def _bounds_again(cloud: Cloud, places: Floats, good: int) -> tuple[Floats, Floats, int]:
-    """Return the bounds without the points on some places, and the number of these among the good ones."""
+def bounds_of_some(cloud: Cloud, points: int = 50_000) -> Floats | None:
+    """Return the (2, 3) bounds of the first points that are no noise and mark no missing return, if any.
+
+    Raises:
+        InputError: if the file is truncated or damaged.
+
+    """
+    none = NoReturns()
+    for xyz in surface_chunks(cloud, points):
+        none.look(xyz)
+        good = without(xyz, none.places)
+        good = good[np.isfinite(good).all(axis=1)]
+        if len(good):
+            return np.stack([good.min(axis=0), good.max(axis=0)])
+    return None
+
+
+def header_remark(cloud: Cloud, whole: Floats) -> str | None:
+    """Return in a sentence how the bounds that a file's header states differ from those of its points.
+
+    Args:
+        cloud: the file; of a cloud that is none nothing is said.
+        whole: (2, 3) bounds of all its points.
+
+    """
+    scales = getattr(getattr(cloud, "header", None), "scales", None)
+    if scales is None:
+        return None
+    stated = np.stack([cloud.minimum, cloud.maximum])
+    tolerance = bounds_tolerance(scales, whole)
+    if np.isfinite(stated).all() and (np.abs(stated - whole) <= tolerance).all():
+        return None
+    low, high = (", ".join(f"{value:.10g}" for value in row) for row in whole)
+    return f"its header's bounds are wrong: the points lie between ({low}) and ({high}), which is used"
+
+
+def bounds_tolerance(scales: Floats, whole: Floats) -> Floats:
+    """Return by how much bounds in a header may differ from those of the points by rounding alone, (3,)."""
+    return np.asarray(np.maximum(2.0 * np.abs(scales), 1e-9 * np.abs(whole).max(axis=0)))
+
+
+def _bounds_again(cloud: Cloud, places: Floats, box: Floats | None, good: int) -> tuple[Floats, Floats, int]:
+    """Return the bounds without the points on some places or beyond a box, and the number of these."""
     minimum, maximum, returned = np.full(3, np.inf), np.full(3, -np.inf), 0
-    for xyz in surface_chunks(cloud, places=places):
+    for xyz in surface_chunks(cloud, places=places, box=box):
         np.minimum(minimum, xyz.min(axis=0), out=minimum)
         np.maximum(maximum, xyz.max(axis=0), out=maximum)
         returned += len(xyz)
     return minimum, maximum, good - returned
 
 
-def surface_chunks(cloud: Cloud, size: int = CHUNK_POINTS, places: Floats | None = None) -> Iterator[Floats]:
+def surface_chunks(
+    cloud: Cloud, size: int = CHUNK_POINTS, places: Floats | None = None, box: Floats | None = None
+) -> Iterator[Floats]:
     """Yield the whole cloud as `scan` reads it: (n, 3) float64 file coordinates, noise left out.
 
     Args:
         cloud: what to read.
         size: points of a chunk at most.
         places: (k, 3) file coordinates whose points are left out too: those of no returns.
+        box: (2, 3) file coordinates beyond which points are left out too: strays.
 
     Raises:
         InputError: if the file is truncated or damaged.
@@ -129,6 +204,7 @@ def surface_chunks(cloud: Cloud, size: int = CHUNK_POINTS, places: Floats | None
         good = xyz[~noise] if noise.any() else xyz
         if places is not None:
             good = without(good, places)
+        good = within(good, box)
         if len(good):
             yield good
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
+from mtpcr_geo.core.errors import CrsError
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.crs import TransformChain
 
@@ -142,9 +143,22 @@ class Moved(Cloud):
         self.name = base.name
         self.crs = crs
         self.count = base.count
-        axes = np.stack([base.minimum, base.maximum], axis=1)
-        moved = move(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
-        self.minimum, self.maximum = moved.min(axis=0), moved.max(axis=0)
+        self.minimum, self.maximum = self._bounds()
+
+    def _bounds(self) -> tuple[Floats, Floats]:
+        """Return the bounds by those of the base, or by its points where those make no sense."""
+        axes = np.stack([self.base.minimum, self.base.maximum], axis=1)
+        if np.isfinite(axes).all():
+            try:
+                moved = self.move(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
+            except CrsError:
+                pass
+            else:
+                return moved.min(axis=0), moved.max(axis=0)
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        for xyz in self.xyz_chunks():
+            low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
+        return low, high
 
     def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
         """Yield (n, 3) float64 moved coordinates, n <= size."""

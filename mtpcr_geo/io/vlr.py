@@ -32,6 +32,8 @@ class Record:
         description: up to 32 bytes of text.
         data: its content.
         extended: True if it stood behind the points.
+        place: byte of the file at which the content begins, where it is too large to be held; else None.
+        size: bytes of the content, held or not.
 
     """
 
@@ -40,6 +42,8 @@ class Record:
     description: str
     data: bytes
     extended: bool = False
+    place: int | None = None
+    size: int = 0
 
     @property
     def states_crs(self) -> bool:
@@ -57,14 +61,14 @@ class Record:
 def read_records(
     stream: BinaryIO, start: int, count: int, extended: bool, limit: int = 16_000_000
 ) -> list[Record]:
-    """Read `count` records from byte `start`; those larger than `limit` bytes are passed over.
+    """Read `count` records from byte `start`; of those larger than `limit` bytes only the head is held.
 
     Args:
         stream: the open file.
         start: where the first record begins.
         count: how many follow each other.
         extended: whether they are the 60 byte kind behind the points, or the 54 byte kind before them.
-        limit: waveforms and octree hierarchies can be as large as the points; nothing here needs them.
+        limit: waveforms, octree hierarchies and others can be as large as the points.
 
     Raises:
         ValueError: if the file ends before they do.
@@ -72,24 +76,34 @@ def read_records(
     """
     layout = struct.Struct("<2x16sHQ32s" if extended else "<2x16sHH32s")
     records = []
+    end = stream.seek(0, 2)
     stream.seek(start)
     for _ in range(count):
         head = stream.read(layout.size)
         if len(head) < layout.size:
             raise ValueError("the file ends within its variable length records")
         user, record_id, size, description = layout.unpack(head)
-        if size > limit:
-            stream.seek(size, 1)
-            continue
-        data = stream.read(size)
-        if len(data) < size:
+        place = stream.tell()
+        if place + size > end:
             raise ValueError("the file ends within its variable length records")
-        records.append(Record(_text(user), record_id, _text(description), data, extended))
+        large = size > limit
+        data = b"" if large else stream.read(size)
+        stream.seek(place + size)
+        records.append(
+            Record(
+                text_of(user), record_id, text_of(description), data, extended, place if large else None, size
+            )
+        )
     return records
 
 
-def _text(raw: bytes) -> str:
-    return raw.split(b"\0")[0].decode("ascii", errors="ignore")
+def text_of(raw: bytes) -> str:
+    """Return a padded text of a header or record: UTF-8, or Latin-1 as older programs write it."""
+    text = raw.split(b"\0")[0]
+    try:
+        return text.decode()
+    except UnicodeDecodeError:
+        return text.decode("latin-1")
 
 
 def crs_of_records(records: Sequence[Record]) -> tuple[CRS | None, str]:
@@ -98,7 +112,7 @@ def crs_of_records(records: Sequence[Record]) -> tuple[CRS | None, str]:
     WKT comes before GeoTIFF keys; a record behind the points counts like one before them.
 
     Returns:
-        The CRS, or None; and where there is None, why ("" if the file states nothing).
+        The CRS, or None; and what of it cannot be used, or why there is None ("" if the file states nothing).
 
     """
     from pyproj import CRS
@@ -117,11 +131,11 @@ def crs_of_records(records: Sequence[Record]) -> tuple[CRS | None, str]:
     parts = {record.record_id: record.data for record in records if record.states_crs}
     if GEOKEYS in parts:
         try:
-            crs = crs_of_geokeys(parts[GEOKEYS], parts.get(GEODOUBLES, b""), parts.get(GEOASCII, b""))
+            crs, part = crs_of_geokeys(parts[GEOKEYS], parts.get(GEODOUBLES, b""), parts.get(GEOASCII, b""))
         except ValueError as error:
             return None, problem or f"its GeoTIFF keys cannot be understood ({_first_line(error)})"
         if crs is not None:
-            return crs, ""
+            return crs, part
         problem = problem or "its GeoTIFF keys name no coordinate reference system"
     return None, problem
 

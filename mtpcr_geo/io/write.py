@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import OutputError
+from mtpcr_geo.io.foreign import append_large, restore_texts
 from mtpcr_geo.io.las import LasCloud
 from mtpcr_geo.io.layout import layout
+from mtpcr_geo.io.storage import MOST_STEPS, MisfitError, Move, Storage, settled
 from mtpcr_geo.io.waveform import append_waveforms
 
 if TYPE_CHECKING:
@@ -24,11 +26,10 @@ if TYPE_CHECKING:
 
     from mtpcr_geo.core.progress import Progress
 
-Move = Callable[[Floats], Floats]
 STEP, FINEST_STEP = 0.001, 0.0001  # metres or feet
 DEGREE_STEP = 1e-9  # a tenth of a millimetre, and 32 bits still span four degrees
+COARSEST_DEGREE_STEP = 1e-8  # a millimetre, as STEP is
 _METRES_A_DEGREE = 1e5
-_INT32 = 2**31 - 1
 
 
 def write_cloud(
@@ -39,12 +40,17 @@ def write_cloud(
     scale: float | tuple[float, float, float] | None = None,
     progress: Progress | None = None,
     advance: Callable[[int], object] | None = None,
-) -> None:
+    *,
+    returning: bool = False,
+) -> int:
     """Write a cloud, its coordinates moved on the way.
 
     LAS 1.4 in the point format from 6 up that holds all there is; the CRS as WKT; records that are
     neither about the CRS nor about the file's layout are kept. Memory does not grow with the number
     of points; COPC, which has to be sorted, spools to a temporary file beside the output.
+
+    Where the points do not fit the 32 bit integers of a LAS file, a pass over them settles scale and offset
+    so that they do, and it is written again. A few points too far from all others for that are left out.
 
     Args:
         path: where to write; ``.las``, ``.laz`` or ``.copc.laz`` is the format.
@@ -55,38 +61,68 @@ def write_cloud(
             finer, down to 0.0001. For geographic coordinates 1e-9 degrees.
         progress: where to report the points written.
         advance: called with the number of points of each chunk written.
+        returning: choose a scale so fine that the cloud can be moved back onto its coordinates.
+
+    Returns:
+        The number of points left out.
 
     Raises:
-        OutputError: if the file cannot be written, or the coordinates do not fit the scale.
+        OutputError: if the file cannot be written, or too many coordinates do not fit the scale.
         InputError: if the cloud cannot be read.
 
     """
     task: Any = nullcontext(lambda n: None)
     if progress is not None:
         task = progress.task(f"writing {path.name}", cloud.count)
-    header, chunks = layout(cloud, crs)
     with task as report:
+        written, left = 0, 0
 
         def reported(count: int) -> None:
-            report(count)
+            nonlocal written, left
+            again = min(count, left)  # counted already by a try that ended
+            left -= again
+            written += count
+            report(count - again)
             if advance is not None:
-                advance(count)
+                advance(count - again)
 
-        placed = _placed(header, chunks, move, _scales(cloud, crs, scale), reported)
+        scales = returning_scales(cloud, crs) if returning else scales_of(cloud, crs, scale)
+        storage = Storage(scales, None)
         try:
-            if is_copc(path):
-                from mtpcr_geo.io.copc import write_copc
+            _write(path, cloud, move, crs, storage, reported)
+        except MisfitError:
+            left = written
+            coarsest = None if scale is not None else _coarsest(crs)
+            storage = settled(cloud, move, scales, coarsest)
+            _write(path, cloud, move, crs, storage, reported)
+    return storage.left_out
 
-                write_copc(path, header, placed)
-            else:
-                _write_las(path, header, placed)
-                if isinstance(cloud, LasCloud):
-                    append_waveforms(path, cloud)
-        except (OSError, lazrs.LazrsError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise OutputError(
-                f"cannot write in {path.parent}: {reason}; check rights and free space"
-            ) from error
+
+def _write(
+    path: Path,
+    cloud: Cloud,
+    move: Move | None,
+    crs: CRS | None,
+    storage: Storage,
+    advance: Callable[[int], object],
+) -> None:
+    header, chunks = layout(cloud, crs)
+    placed = _placed(header, chunks, move, storage, advance)
+    try:
+        if is_copc(path):
+            from mtpcr_geo.io.copc import write_copc
+
+            write_copc(path, header, placed)
+        else:
+            _write_las(path, header, placed)
+            if isinstance(cloud, LasCloud):
+                append_waveforms(path, cloud)
+        if isinstance(cloud, LasCloud):
+            append_large(path, cloud)
+            restore_texts(path, cloud)
+    except (OSError, lazrs.LazrsError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise OutputError(f"cannot write in {path.parent}: {reason}; check rights and free space") from error
 
 
 def is_copc(path: Path) -> bool:
@@ -109,7 +145,7 @@ def returning_scales(cloud: Cloud, crs: CRS | None) -> Floats:
         scales = np.clip(scales, FINEST_STEP / 10, STEP)
     extent = cloud.maximum - cloud.minimum
     if cloud.crs is None or not cloud.crs.is_geographic:
-        while np.isfinite(extent).all() and scales.min() < STEP and extent.max() / scales.min() > _INT32:
+        while np.isfinite(extent).all() and scales.min() < STEP and extent.max() / scales.min() > MOST_STEPS:
             scales = np.minimum(scales * 10, STEP)
     if crs is not None and crs.is_geographic:
         scales[:2] = np.minimum(scales[:2] / _METRES_A_DEGREE, DEGREE_STEP)
@@ -148,7 +184,24 @@ def _of_one_channel(chunks: Iterator[NDArray[Any]]) -> Iterator[NDArray[Any]]:
         yield chunk
 
 
-def _scales(cloud: Cloud, crs: CRS | None, given: float | tuple[float, float, float] | None) -> Floats:
+def _coarsest(crs: CRS | None) -> Floats:
+    """Return the coarsest scales that are taken without being asked for: a millimetre."""
+    if crs is not None and crs.is_geographic:
+        return np.array([COARSEST_DEGREE_STEP, COARSEST_DEGREE_STEP, STEP])
+    return np.full(3, STEP)
+
+
+def scales_of(
+    cloud: Cloud, crs: CRS | None, given: float | tuple[float, float, float] | None = None
+) -> Floats:
+    """Return the scales (3,) at which a cloud is written: those given, or its own within limits.
+
+    Args:
+        cloud: what is written.
+        crs: of the written coordinates.
+        given: scales asked for.
+
+    """
     if given is not None:
         return np.broadcast_to(np.asarray(given, np.float64), 3).copy()
     scales = np.full(3, STEP)
@@ -163,27 +216,33 @@ def _placed(
     header: laspy.LasHeader,
     chunks: Iterator[tuple[Floats, NDArray[Any]]],
     move: Move | None,
-    scales: Floats,
+    storage: Storage,
     advance: Callable[[int], object],
 ) -> Iterator[NDArray[Any]]:
-    """Fill X, Y, Z into the packed records; the first chunk settles the header's scales and offsets."""
-    header.scales = scales
-    settled = False
+    """Fill X, Y, Z into the packed records; the first chunk settles what the storage leaves open.
+
+    Raises:
+        MisfitError: if a point does not fit, and the storage does not leave such points out.
+
+    """
+    header.scales = storage.scales
+    offsets = storage.offsets
     for xyz, packed in chunks:
         moved = xyz if move is None else move(xyz)
-        if not settled:
-            middle = (moved.min(axis=0) + moved.max(axis=0)) / 2
-            header.offsets = np.rint(middle)
-            settled = True
-        steps = np.rint((moved - header.offsets) / scales)
+        if offsets is None:
+            offsets = np.rint((moved.min(axis=0) + moved.max(axis=0)) / 2)
+        header.offsets = offsets
+        steps = np.rint((moved - offsets) / storage.scales)
         worst = float(np.abs(steps).max())
-        if not worst <= _INT32:
-            distance = float(np.abs(moved - header.offsets).max())
-            raise OutputError(
-                f"a point {distance:.0f} from the others does not fit a LAS file at scale {scales.min():g}; "
-                "give a coarser scale, or remove stray points"
-            )
+        kept = packed
+        if not worst <= MOST_STEPS:
+            if storage.offsets is None:
+                raise MisfitError
+            fits = (np.abs(steps) <= MOST_STEPS).all(axis=1)
+            storage.left_out += int((~fits).sum())
+            kept, steps = packed[fits], steps[fits]
         for axis, name in enumerate("XYZ"):
-            packed[name] = steps[:, axis]
-        yield packed
+            kept[name] = steps[:, axis]
+        if len(kept):
+            yield kept
         advance(len(packed))

@@ -19,6 +19,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from pydantic.fields import FieldInfo
 
 from mtpcr_geo.core.suggestions import meant
+from mtpcr_geo.core.units import UNITS, Axes, Unit
 
 INPUTS = "Inputs and CRS"
 RASTERS = "Levelling and rasters"
@@ -54,7 +55,7 @@ SourceCrs = Annotated[
     str | None,
     Field(
         description="CRS of the source, instead of what its file states, such as EPSG:2154 or "
-        "EPSG:25832+5783; local for a cloud without one, in metres"
+        "EPSG:25832+5783; local for a cloud without one"
     ),
     Shown(INPUTS),
 ]
@@ -63,6 +64,22 @@ TargetCrs = Annotated[
     Field(description="CRS of the target, instead of what its file states; likewise"),
     Shown(INPUTS),
 ]
+SourceUnit = Annotated[
+    Unit | None,
+    Field(description="unit of a local source, if not metres; a CRS states its own"),
+    Shown(INPUTS, metavar=f"[{'|'.join(UNITS)}]"),
+]
+TargetUnit = Annotated[
+    Unit | None,
+    Field(description="unit of a local target, likewise"),
+    Shown(INPUTS, metavar=f"[{'|'.join(UNITS)}]"),
+]
+SourceAxes = Annotated[
+    Axes,
+    Field(description="which axis of a local source points up, or down, in right-handed axes"),
+    Shown(INPUTS),
+]
+TargetAxes = Annotated[Axes, Field(description="the same of a local target"), Shown(INPUTS)]
 Local = Annotated[
     bool,
     Field(description="both clouds are local, in metres, whatever their files state"),
@@ -332,6 +349,10 @@ class MethodOptions(PriorOptions):
 
     source_crs: SourceCrs = None
     target_crs: TargetCrs = None
+    source_unit: SourceUnit = None
+    target_unit: TargetUnit = None
+    source_axes: SourceAxes = "z-up"
+    target_axes: TargetAxes = "z-up"
     local: Local = False
     level: LevelMethod = "auto"
     cell: Cell = None

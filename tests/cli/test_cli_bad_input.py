@@ -34,7 +34,9 @@ def clouds(town_files, tmp_path_factory) -> dict[str, Path]:
     source, target = town_files
     folder = tmp_path_factory.mktemp("bad")
     town = np.asarray(laspy.read(source).xyz)
-    made = {"source": source, "target": target, "missing": folder / "missing.laz", "folder": folder}
+    made = {"source": source, "target": target, "missing": folder / "missing.laz"}
+    made["folder"] = folder / "without"
+    made["folder"].mkdir()
     made["empty"] = write(folder / "empty.laz", np.empty((0, 3)))
     made["one"] = write(folder / "one.laz", town[:1])
     made["equal"] = write(folder / "equal.laz", np.repeat(town[:1], 500, axis=0))
@@ -56,7 +58,7 @@ def clouds(town_files, tmp_path_factory) -> dict[str, Path]:
 
 CASES = {
     "missing": ("missing", "target", 5, "missing.laz"),
-    "a folder": ("folder", "target", 5, "folder"),
+    "a folder without clouds": ("folder", "target", 5, "names no cloud"),
     "empty cloud": ("empty", "target", 5, "empty.laz"),
     "one point": ("one", "target", 5, "one.laz"),
     "points all equal": ("equal", "target", 5, "equal.laz"),

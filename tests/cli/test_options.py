@@ -146,7 +146,9 @@ def test_the_command_gives_register_the_defaults_of_python(tmp_path, monkeypatch
 
 def test_every_option_reaches_register(monkeypatch):
     values = {
-        "source_crs": "EPSG:2154", "target_crs": "EPSG:25832", "local": True, "level": "none", "cell": 0.75,
+        "source_crs": "EPSG:2154", "target_crs": "EPSG:25832", "local": True,
+        "source_unit": "mm", "target_unit": "us-ft", "source_axes": "y-up", "target_axes": "z-down",
+        "level": "none", "cell": 0.75,
         "vertical": "estimate", "out_crs": "EPSG:25833", "prior": "none", "near": (4.5, -52.0),
         "near_crs": "EPSG:4326", "within": 40.0, "yaw": -30.0, "yaw_tolerance": 8.0,
         "motion": "yaw", "profile": "paper", "matcher": "orb", "models": "folder",

@@ -20,6 +20,7 @@ from mtpcr_geo.registration import register
 
 KEYS = re.findall(r"^- ``(.+?)``: ", run_json.__doc__ or "", flags=re.M)
 RARE = {
+    "mtpcr.level <role>.header_remarks",
     "frames",  # null where no pair was made
     "metrics",  # empty where there is no verdict
     "metrics.vertical_offset_m",

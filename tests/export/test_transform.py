@@ -17,12 +17,13 @@ from mtpcr_geo.core.errors import CrsError, InputError, OutputError
 from mtpcr_geo.core.types import Pair, Side
 from mtpcr_geo.crs import TransformChain, resolve_frames
 from mtpcr_geo.export.apply import apply_transform, moved_by
-from mtpcr_geo.export.descriptions import shift_text
+from mtpcr_geo.export.descriptions import shift_text, transform_rows
+from mtpcr_geo.export.pdal_file import write_pdal_pipeline
+from mtpcr_geo.export.prior_file import read_pose
 from mtpcr_geo.export.transform import (
     dumps,
     read_transform,
     write_cloudcompare_matrix,
-    write_pdal_pipeline,
     write_transform_json,
 )
 from mtpcr_geo.io import ArrayCloud
@@ -194,8 +195,11 @@ def test_cloudcompare_matrix_on_shifted_coordinates(tmp_path, kind):
     pair = pair_of(kind)
     write_cloudcompare_matrix(tmp_path / "cc.txt", pair)
     write_transform_json(tmp_path / "t.json", pair)
-    rows = [line.split() for line in (tmp_path / "cc.txt").read_text().splitlines()]
+    lines = (tmp_path / "cc.txt").read_text().splitlines()
+    # CloudCompare reads the first four
+    rows = [line.split() for line in lines[:4]]
     assert [len(row) for row in rows] == [4, 4, 4, 4]
+    assert all(line.startswith("# ") for line in lines[4:])
     matrix = np.array(rows, float)
     said = json.loads((tmp_path / "t.json").read_text())["cloudcompare"]
     xyz = file_xyz(pair.source.cloud)
@@ -204,10 +208,22 @@ def test_cloudcompare_matrix_on_shifted_coordinates(tmp_path, kind):
     placed = transforms.apply(matrix, local) - said["target_global_shift"]
     assert np.allclose(placed, TransformChain.of(pair).forward(xyz), rtol=0, atol=5e-4)
     assert np.abs(matrix[:3, 3]).max() < 5000
+    shift = next(line for line in lines if line.startswith("# source global shift: "))
+    assert [float(word) for word in shift.split(": ")[1].split()] == said["source_global_shift"]
+    # the file says enough to be a prior
+    pose = read_pose(tmp_path / "cc.txt")
+    assert isinstance(pose, np.ndarray)
+    # sums far from the origin cost digits
+    assert np.allclose(transforms.apply(pose, xyz), TransformChain.of(pair).forward(xyz), rtol=0, atol=1e-6)
+    assert (
+        ", ".join(f"{v:.10g}" for v in said["source_global_shift"])
+        in dict(transform_rows(pair))["in CloudCompare"]
+    )
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "local to metres"])
-def test_pdal_does_the_same(tmp_path, kind):
+def test_pdal_does_the_same(tmp_path, monkeypatch, kind):
+    monkeypatch.chdir(tmp_path)
     pdal = pytest.importorskip("pdal", reason="PDAL is not installed")
     pair = pair_of(
         kind,
@@ -229,7 +245,7 @@ def test_pdal_writes_the_whole_pipeline(tmp_path, monkeypatch):
     write_pdal_pipeline(tmp_path / "p.pdal.json", pair)
     monkeypatch.chdir(tmp_path)
     pdal.Pipeline((tmp_path / "p.pdal.json").read_text()).execute()
-    result = open_cloud(tmp_path / "source_registered.laz")
+    result = open_cloud(tmp_path / "source_registered.las")
     expected = TransformChain.of(pair).forward(file_xyz(pair.source.cloud))
     assert np.allclose(file_xyz(result), expected, rtol=0, atol=0.00051)
     assert result.crs is not None

@@ -229,10 +229,10 @@ def test_plain_pdal_applies_the_transform_as_we_do(where, pdal, request, tmp_pat
         options = {"source_crs": "EPSG:28992", "target_crs": "EPSG:28992"}
     out = tmp_path / "out"
     register(source, target, out, recording=False, **options)
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.chdir(out)  # its paths are as seen from where it lies
     pdal.Pipeline((out / "transform.pdal.json").read_text(encoding="utf-8")).execute()
     apply_transform(out / "transform.json", source, tmp_path / "ours.laz")
-    (theirs,) = (path for path in tmp_path.glob("*.la?") if path.name != "ours.laz")
+    (theirs,) = out.glob("*_registered.la?")
     mine, plain = laspy.read(tmp_path / "ours.laz"), laspy.read(theirs)
     before = laspy.read(source)
     assert len(mine) == len(plain) == len(before)

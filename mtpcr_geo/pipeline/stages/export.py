@@ -201,18 +201,16 @@ class WriteTransform(EvidenceWriter):
         self.forced = (
             pair.verdict is not None and pair.verdict.withholds_cloud is not None and self.options.force
         )
-        from mtpcr_geo.export.transform import (
-            write_cloudcompare_matrix,
-            write_pdal_pipeline,
-            write_transform_json,
-        )
+        from mtpcr_geo.export.pdal_file import write_pdal_pipeline
+        from mtpcr_geo.export.transform import write_cloudcompare_matrix, write_transform_json
 
         path = context.outputs.path(self.options.filename)
         if self.format == "json":
             write_transform_json(path, pair, forced=self.forced)
+        elif self.format == "pdal":
+            write_pdal_pipeline(path, pair, self.options.filename.parent)
         else:
-            write = {"cloudcompare": write_cloudcompare_matrix, "pdal": write_pdal_pipeline}[self.format]
-            write(path, pair)
+            write_cloudcompare_matrix(path, pair)
 
     @property
     def format(self) -> TransformFormat:

@@ -32,6 +32,20 @@ def _checked_bounds(values: list[str]) -> list[str]:
     return values
 
 
+_READER_SYNONYMS = {"spatialreference": "override_srs"}
+_WRITER_SYNONYMS = {"spatialreference": "a_srs"}
+
+
+def _without_synonyms(options: Any, synonyms: Mapping[str, str]) -> Any:
+    """Return options under the one name that each has here, of the several that PDAL takes."""
+    if not isinstance(options, Mapping):
+        return options
+    twice = [f"{old} and {new}" for old, new in synonyms.items() if old in options and new in options]
+    if twice:
+        raise ValueError(f"{twice[0]} are the same option; leave one of them out")
+    return {synonyms.get(name, name): value for name, value in options.items()}
+
+
 FileName = Annotated[Path, BeforeValidator(_path_of)]
 Bounds = Annotated[list[str], BeforeValidator(_listed), Field(min_length=1)]
 
@@ -43,6 +57,11 @@ class LasReaderOptions(StageOptions):
     count: int | None = Field(None, ge=1, description="read at most this many points, from the first on")
     override_srs: str | None = Field(None, description="CRS to take instead of what the file states")
     default_srs: str | None = Field(None, description="CRS to take where the file states none")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _synonyms(cls, options: Any) -> Any:
+        return _without_synonyms(options, _READER_SYNONYMS)
 
 
 class LasReader(Stage):
@@ -79,14 +98,26 @@ class LasReader(Stage):
         return cloud
 
     def _open(self) -> Cloud:
-        from mtpcr_geo.io.las import open_cloud
+        from mtpcr_geo.io.formats import open_any
 
         override = stated_crs(self, "override_srs", self.options.override_srs)
         default = stated_crs(self, "default_srs", self.options.default_srs)
-        cloud: Cloud = open_cloud(self.options.filename, override)
+        cloud = open_any(self.options.filename, override)
         if cloud.crs is None and default is not None:
-            cloud = open_cloud(self.options.filename, default)
+            cloud = open_any(self.options.filename, default)
         return cloud
+
+
+class FileReader(LasReader):
+    """Read a cloud in any format that is read without PDAL, or many files as one."""
+
+    type: ClassVar[str] = "mtpcr.read"
+
+    def reads(self) -> list[Path]:
+        """Name the files."""
+        from mtpcr_geo.io.formats import files_at
+
+        return files_at(self.options.filename)
 
 
 class CopcReaderOptions(LasReaderOptions):
@@ -163,6 +194,7 @@ class LasWriterOptions(StageOptions):
     @model_validator(mode="before")
     @classmethod
     def _plain(cls, options: Any) -> Any:
+        options = _without_synonyms(options, _WRITER_SYNONYMS)
         compression = options.get("compression") if isinstance(options, dict) else None
         if isinstance(compression, bool):
             return {**options, "compression": str(compression).lower()}
@@ -215,8 +247,50 @@ class LasWriter(Stage):
         path = context.outputs.path(self.options.filename)
         base, move = (cloud.base, cloud.move) if isinstance(cloud, Moved) else (cloud, None)
         with context.progress.task(f"writing {self.options.filename.name}", cloud.count) as advance:
-            write_cloud(path, base, move, crs, scale, advance=advance)
-        self.metadata |= {"filename": str(self.options.filename), "count": cloud.count}
+            left_out = write_cloud(path, base, move, crs, scale, advance=advance)
+        self.metadata |= {"filename": str(self.options.filename), "count": cloud.count - left_out}
+        if left_out:
+            self.metadata["left_out"] = left_out
+        return cloud
+
+
+class EachWriterOptions(StageOptions):
+    """Options of mtpcr.write_each."""
+
+    filename: Path = Field(description="files to write, with a # for their names")
+    names: list[str] = Field(description="a name for each file of the cloud, in their order", min_length=1)
+
+
+class EachWriter(Stage):
+    """Write a cloud of many files as many files: LAS 1.4 or LAZ, as writers.las does."""
+
+    type: ClassVar[str] = "mtpcr.write_each"
+    Options: ClassVar[OptionsModel] = EachWriterOptions
+    options: EachWriterOptions
+
+    def writes(self) -> list[Path]:
+        """Name the files."""
+        return [self.options.filename.with_name(name) for name in self.options.names]
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Stream each part to its file, and hand the cloud on."""
+        from mtpcr_geo.io.many import ManyFiles
+        from mtpcr_geo.io.write import write_cloud
+
+        cloud = one_cloud(self, inputs)
+        base, move = (cloud.base, cloud.move) if isinstance(cloud, Moved) else (cloud, None)
+        parts = base.parts if isinstance(base, ManyFiles) else (base,)
+        if len(parts) != len(self.options.names):
+            raise OptionError(
+                f"{self.label}: {len(parts)} files are to be written, and {len(self.options.names)} named"
+            )
+        left_out = 0
+        with context.progress.task(f"writing {len(parts)} files", cloud.count) as advance:
+            for part, final in zip(parts, self.writes(), strict=True):
+                left_out += write_cloud(context.outputs.path(final), part, move, cloud.crs, advance=advance)
+        self.metadata |= {"filename": str(self.options.filename), "count": cloud.count - left_out}
+        if left_out:
+            self.metadata["left_out"] = left_out
         return cloud
 
 

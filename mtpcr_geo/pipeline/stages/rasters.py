@@ -12,7 +12,8 @@ from pydantic import Field
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
-from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.errors import CrsError, InputError, OptionError
+from mtpcr_geo.core.scanner import Scanner, check_unit
 from mtpcr_geo.core.types import Bev, Pair, RasterSettings, Side
 from mtpcr_geo.method.bev import (
     Cells,
@@ -25,7 +26,20 @@ from mtpcr_geo.method.bev import (
     make_bev,
     rasterise,
 )
-from mtpcr_geo.pipeline.options import Cell, LevelMethod, Local, OutCrs, Seed, SourceCrs, TargetCrs, Vertical
+from mtpcr_geo.pipeline.options import (
+    Cell,
+    LevelMethod,
+    Local,
+    OutCrs,
+    Seed,
+    SourceAxes,
+    SourceCrs,
+    SourceUnit,
+    TargetAxes,
+    TargetCrs,
+    TargetUnit,
+    Vertical,
+)
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 
 if TYPE_CHECKING:
@@ -38,6 +52,10 @@ class LevelOptions(StageOptions):
     method: LevelMethod = "auto"
     target_crs: TargetCrs = None
     source_crs: SourceCrs = None
+    target_unit: TargetUnit = None
+    source_unit: SourceUnit = None
+    target_axes: TargetAxes = "z-up"
+    source_axes: SourceAxes = "z-up"
     local: Local = False
     vertical: Vertical = "refuse"
     out_crs: OutCrs = None
@@ -60,14 +78,21 @@ class Level(Stage):
     def check_inputs(self, inputs: Sequence[Value], context: RunContext) -> None:
         """Settle the frames from the headers, so that a CRS that does not do is known before the run."""
         from mtpcr_geo.io.las import check_distinct
+        from mtpcr_geo.io.sample import bounds_of_some
 
         clouds = [value for value in inputs if isinstance(value, Cloud)]
         if len(clouds) in (1, 2) and all(cloud.count for cloud in clouds):
-            self._frames(clouds[0], clouds[-1])
+            try:
+                self._frames(clouds[0], clouds[-1])
+            except (CrsError, InputError):
+                # a header is a hint: ask again by some points before refusing
+                self._frames(clouds[0], clouds[-1], [bounds_of_some(cloud) for cloud in clouds])
         if len(clouds) == 2:
             check_distinct(*clouds)
 
-    def _frames(self, target: Cloud, source: Cloud) -> tuple[WorkFrame, FrameLink, FrameLink]:
+    def _frames(
+        self, target: Cloud, source: Cloud, bounds: Sequence[Floats | None] = (None,)
+    ) -> tuple[WorkFrame, FrameLink, FrameLink]:
         from mtpcr_geo.crs import resolve_frames
 
         return resolve_frames(
@@ -78,12 +103,21 @@ class Level(Stage):
             local=self.options.local,
             vertical=self.options.vertical,
             out_crs=self.options.out_crs,
+            target_bounds=bounds[0],
+            source_bounds=bounds[-1],
+            target_scanner=self._scanner("target"),
+            source_scanner=self._scanner("target" if source is target else "source"),
         )
+
+    def _scanner(self, role: Literal["target", "source"]) -> Scanner:
+        if role == "target":
+            return Scanner(self.options.target_unit, self.options.target_axes)
+        return Scanner(self.options.source_unit, self.options.source_axes)
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Scan, sample and level each cloud."""
         from mtpcr_geo.io.las import check_distinct
-        from mtpcr_geo.io.sample import scan
+        from mtpcr_geo.io.sample import header_remark, scan
         from mtpcr_geo.method.levelling import level
 
         clouds = [value for value in inputs if isinstance(value, Cloud)]
@@ -97,20 +131,26 @@ class Level(Stage):
             scan(cloud, budget=options.budget, seed=options.seed, progress=context.progress)
             for cloud in clouds
         ]
-        frame, *links = self._frames(target, source)
+        frame, *links = self._frames(target, source, [scanned.bounds for scanned in found])
         sides = []
         roles: tuple[Literal["target", "source"], ...] = ("target", "source")
         for role, cloud, link, scanned in zip(roles, clouds, links, found, strict=False):
+            if link.file_crs is None and link.scanner.unit is None:
+                check_unit(cloud.name, role, scanned.sample, scanned.count)
             sample = in_work_frame(link, scanned.sample)
             levelling = level(sample, options.method, link.georeferenced, options.seed)
             self.metadata[role] = {
                 "points": scanned.count,
                 "noise_points": scanned.dropped,
                 "no_return_points": scanned.no_returns,
+                "stray_points": scanned.strays,
                 "sampled": len(scanned.sample),
                 **levelling.audit(),
             }
-            bounds = np.stack([scanned.minimum, scanned.maximum])
+            remark = header_remark(cloud, scanned.whole)
+            remarks = () if remark is None else (remark,)
+            if remarks:
+                self.metadata[role]["header_remarks"] = list(remarks)
             sides.append(
                 Side(
                     role,
@@ -119,9 +159,12 @@ class Level(Stage):
                     sample,
                     scanned.complete,
                     levelling,
-                    bounds=bounds,
+                    bounds=scanned.bounds,
                     no_returns=scanned.no_returns,
                     no_return_places=scanned.no_return_places,
+                    strays=scanned.strays,
+                    box=scanned.box,
+                    remarks=remarks,
                 )
             )
         return Pair(sides[0], sides[-1], frame)
@@ -221,7 +264,7 @@ def with_rasters(
 
 
 def _coverage(side: Side) -> Coverage:
-    return coverage_of(side.levelled_sample, points=side.cloud.count - side.no_returns)
+    return coverage_of(side.levelled_sample, points=side.cloud.count - side.no_returns - side.strays)
 
 
 def rasterised(side: Side, cell: float, convention: Convention, context: RunContext) -> Bev:
@@ -237,7 +280,7 @@ def _levelled_chunks(side: Side, context: RunContext) -> Iterator[Floats]:
     from mtpcr_geo.io.sample import surface_chunks
 
     with context.progress.task(f"rasterising {side.cloud.name}", side.cloud.count) as advance:
-        for xyz in surface_chunks(side.cloud, places=side.no_return_places):
+        for xyz in surface_chunks(side.cloud, places=side.no_return_places, box=side.box):
             yield transforms.apply(side.T_level_work, in_work_frame(side.link, xyz))
             advance(len(xyz))
 

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.io.file_cloud import FileCloud
+from mtpcr_geo.io.formats import LAS_ENDINGS, files_at
+from mtpcr_geo.io.las import LasCloud
+from mtpcr_geo.io.many import ManyFiles, is_many, output_names
 from mtpcr_geo.io.memory import cloud_of
 from mtpcr_geo.pipeline.options import OUTPUT_NAMES, MethodOptions, PriorOptions
 from mtpcr_geo.pipeline.stage import Stage
@@ -26,6 +31,9 @@ from mtpcr_geo.pipeline.stages.export import (
 from mtpcr_geo.pipeline.stages.io import (
     CopcReader,
     CopcReaderOptions,
+    EachWriter,
+    EachWriterOptions,
+    FileReader,
     LasReader,
     LasReaderOptions,
     LasWriter,
@@ -77,6 +85,10 @@ def steps_of(options: MethodOptions, prefix: str = "") -> list[Stage]:
         method="ransac" if paper and options.level == "auto" else options.level,
         target_crs=options.target_crs,
         source_crs=options.source_crs,
+        target_unit=options.target_unit,
+        source_unit=options.source_unit,
+        target_axes=options.target_axes,
+        source_axes=options.source_axes,
         local=options.local,
         vertical=options.vertical,
         out_crs=options.out_crs,
@@ -161,8 +173,12 @@ def reader_of(cloud: CloudLike, tag: str) -> Stage:
     if not isinstance(cloud, str | os.PathLike):
         return MemoryReader(cloud_of(cloud, tag), tag)
     path = Path(cloud)
+    if is_many(path):
+        return FileReader(LasReaderOptions(filename=path), tag)
     if path.name.lower().endswith(".copc.laz"):
         return CopcReader(CopcReaderOptions(filename=path), tag)
+    if path.suffix.lower() not in LAS_ENDINGS:
+        return FileReader(LasReaderOptions(filename=path), tag)
     return LasReader(LasReaderOptions(filename=path), tag)
 
 
@@ -171,8 +187,22 @@ def recording_writer(folder: Path) -> Stage:
     return WriteRecording(FileOptions(filename=folder / OUTPUT_NAMES["recording"]), "recording")
 
 
+def part_names(source: object) -> list[str]:
+    """Return what to call the moved files of a source of many; none for a source of one."""
+    if isinstance(source, ManyFiles):
+        return output_names([part.path for part in source.parts if isinstance(part, LasCloud | FileCloud)])
+    if isinstance(source, str | os.PathLike) and is_many(Path(source)):
+        return output_names(files_at(Path(source)))
+    return []
+
+
 def writers_of(
-    folder: Path, *, force: bool, recorded: bool = False, recording: Path | None = None
+    folder: Path,
+    *,
+    force: bool,
+    recorded: bool = False,
+    recording: Path | None = None,
+    parts: Sequence[str] = (),
 ) -> list[Stage]:
     """Make the stages behind the verdict that leave files.
 
@@ -181,6 +211,7 @@ def writers_of(
         force: write cloud, transform and the registered raster though the verdict withholds them.
         recorded: record the run.
         recording: a recording of it that is there already.
+        parts: names of the files of a source of many; the moved ones are written under them.
 
     """
     where = {name: folder / file for name, file in OUTPUT_NAMES.items()}
@@ -200,5 +231,7 @@ def writers_of(
         WriteReport(FileOptions(filename=where["report"]), "report"),
         WriteRun(FileOptions(filename=where["run"]), "run"),
         Apply(ApplyOptions(force=force), "moved"),
-        LasWriter(LasWriterOptions(filename=where["registered"]), "registered"),
+        EachWriter(EachWriterOptions(filename=folder / "registered" / "#", names=list(parts)), "registered")
+        if parts
+        else LasWriter(LasWriterOptions(filename=where["registered"]), "registered"),
     ]

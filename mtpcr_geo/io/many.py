@@ -1,0 +1,181 @@
+"""Many files as one cloud: a folder, a pattern, a list, or a virtual point cloud (``.vpc``)."""
+
+from __future__ import annotations
+
+import glob
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mtpcr_geo.core.arrays import Floats, Mask
+from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
+from mtpcr_geo.core.errors import CrsError, InputError
+from mtpcr_geo.crs.facts import same_place
+from mtpcr_geo.io.file_cloud import FileCloud
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+LIST_MARK = "@"
+
+
+class ManyFiles(FileCloud):
+    """Several files as one cloud: their points in the order of the files, in chunks as of one file.
+
+    Attributes:
+        parts: the clouds of the files.
+
+    """
+
+    def __init__(self, path: Path, crs: CRS | None, parts: Sequence[Cloud]) -> None:
+        super().__init__(path, crs, f"{len(parts)} files", sum(part.count for part in parts))
+        self.parts = tuple(parts)
+        self.minimum = np.min([part.minimum for part in parts], axis=0)
+        self.maximum = np.max([part.maximum for part in parts], axis=0)
+
+    def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
+        """Yield (n, 3) float64 coordinates; but for the last chunk n = size, wherever a file ends."""
+        rows = ((xyz,) for part in self.parts for xyz in part.xyz_chunks(size))
+        for (xyz,) in _refilled(rows, size):
+            yield xyz
+
+    def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, Mask]]:
+        """Yield coordinates (n, 3) and which of them are noise or withheld (n,), likewise."""
+        rows = _refilled((row for part in self.parts for row in part.noise_chunks(size)), size)
+        yield from ((xyz, noise) for xyz, noise in rows)
+
+    def table_chunks(self, size: int = CHUNK_POINTS) -> Iterator[PointTable]:
+        """Yield tables of the dimensions that all files have, n <= size rows each."""
+        common: set[str] | None = None
+        for part in self.parts:
+            first = next(iter(part.table_chunks(1)), None)
+            names = set(first or ())
+            common = names if common is None else common & names
+        for part in self.parts:
+            for table in part.table_chunks(size):
+                yield {name: values for name, values in table.items() if name in (common or ())}
+
+
+def _refilled(rows: Iterator[tuple[np.ndarray, ...]], size: int) -> Iterator[tuple[np.ndarray, ...]]:
+    """Cut columns anew, so that all chunks but the last have `size` rows."""
+    kept: list[tuple[np.ndarray, ...]] = []
+    held = 0
+    for row in rows:
+        kept.append(row)
+        held += len(row[0])
+        while held >= size:
+            whole = (
+                kept[0]
+                if len(kept) == 1
+                else tuple(np.concatenate(column) for column in zip(*kept, strict=True))
+            )
+            yield tuple(column[:size] for column in whole)
+            held -= size
+            kept = [tuple(column[size:] for column in whole)] if held else []
+    if held:
+        yield tuple(np.concatenate(column) for column in zip(*kept, strict=True))
+
+
+def is_many(path: str | Path) -> bool:
+    """Return whether a path names several files: a folder, a pattern, a ``.vpc``, or ``@`` and a list."""
+    text = str(path)
+    found = Path(path)
+    if found.is_dir() or text.startswith(LIST_MARK):
+        return True
+    if found.is_file():
+        return found.suffix.lower() == ".vpc"
+    return glob.has_magic(text)
+
+
+def files_of(path: str | Path, is_cloud: Callable[[Path], bool]) -> list[Path]:
+    """Return the files that a path names, in the order of their names, or of the list.
+
+    Args:
+        path: a folder (the clouds right in it); a pattern such as ``tiles/*.laz``; a ``.vpc``; or ``@`` and a
+            text file with a path a line, relative to it.
+        is_cloud: whether a file in a folder is one.
+
+    Raises:
+        InputError: if there is none, or a list cannot be read.
+
+    """
+    text, found = str(path), Path(path)
+    if text.startswith(LIST_MARK):
+        files = _listed(Path(text[len(LIST_MARK) :]))
+    elif found.is_dir():
+        files = sorted(one for one in found.iterdir() if one.is_file() and is_cloud(one))
+    elif found.is_file():
+        files = _of_vpc(found)
+    else:
+        files = sorted(Path(one) for one in glob.glob(text, recursive=True) if Path(one).is_file())
+    if not files:
+        raise InputError(f"{path} names no cloud; check the path, or the endings of the files")
+    missing = next((one for one in files if not one.is_file()), None)
+    if missing is not None:
+        raise InputError(f"{path} names {missing}, which is not there; check the list")
+    return files
+
+
+def join(path: str | Path, parts: Sequence[Cloud], crs: CRS | None) -> ManyFiles:
+    """Join clouds of files to one.
+
+    Args:
+        path: what names them all.
+        parts: the clouds.
+        crs: coordinate reference system to take instead of what the files state.
+
+    Raises:
+        CrsError: if they state different ones.
+
+    """
+    if crs is None:
+        crs = parts[0].crs
+        for part in parts[1:]:
+            same = part.crs is crs or (part.crs is not None and crs is not None and same_place(part.crs, crs))
+            if not same:
+                names = ["none" if one is None else one.name for one in (crs, part.crs)]
+                raise CrsError(
+                    f"{parts[0].name} is in {names[0]} and {part.name} in {names[1]}; bring them to one "
+                    "system first"
+                )
+    return ManyFiles(Path(path), crs, parts)
+
+
+def output_names(files: Sequence[Path]) -> list[str]:
+    """Return names for the moved files: those of the inputs, of other formats with .laz; each once."""
+    names: list[str] = []
+    for file in files:
+        stem = file.name if file.suffix.lower() in (".las", ".laz") else f"{file.stem}.laz"
+        name, number = stem, 2
+        while name.lower() in {one.lower() for one in names}:
+            base, dot, rest = stem.partition(".")
+            name, number = f"{base}_{number}{dot}{rest}", number + 1
+        names.append(name)
+    return names
+
+
+def _listed(path: Path) -> list[Path]:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"cannot read the list {path} ({error}); give a text file with a path a line"
+        ) from error
+    return [path.parent / line.strip() for line in lines if line.strip() and not line.startswith("#")]
+
+
+def _of_vpc(path: Path) -> list[Path]:
+    try:
+        features = json.loads(path.read_text(encoding="utf-8"))["features"]
+        places = [next(iter(one["assets"].values()))["href"] for one in features]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as error:
+        raise InputError(
+            f"{path} is no virtual point cloud ({type(error).__name__}: {error}); make it anew"
+        ) from error
+    remote = next((place for place in places if "://" in place), None)
+    if remote is not None:
+        raise InputError(f"{path} names {remote}; only files on this machine are read")
+    return [path.parent / place for place in places]
