@@ -359,10 +359,7 @@ def apply(
 def build_pipeline(
     source: str | Path, target: str | Path, out: str | Path, options: RegisterOptions
 ) -> list[dict[str, Any]]:
-    """Name the stages of a registration of two files, as pipeline JSON.
-
-    Options at their default are left out.
-    """
+    """Name the stages of a registration of two files, as pipeline JSON; defaults are left out."""
     readers = [reader_of(target, "target"), reader_of(source, "source")]
     steps = chained(steps_of(options), ("target", "source"))
     parts = part_names(source)

@@ -24,7 +24,7 @@ from mtpcr_geo.method.shortcomings import (
     is_mostly_holes,
     relief_m,
 )
-from mtpcr_geo.verdict.decision import FEWEST_GROUND_CELLS
+from mtpcr_geo.verdict.findings import FEWEST_GROUND_CELLS
 
 HARDLY_ANY_ACROSS = 2.5 * MIN_PATCH_CELLS
 """Cells across a cloud below which hardly more than two patches fit beside each other. Of a dense forest

@@ -74,6 +74,12 @@ The metrics:
 - ``metrics.ground_cells``: cells in which both see the ground
 - ``metrics.ground_agreeing``: of these, cells whose heights agree within 0.5 m
 - ``metrics.ground_checked``: whether there are enough of them to judge by
+- ``metrics.ground_spread_m``: spread of the height differences between both grounds, in blocks; null if
+  unknown
+- ``metrics.ground_relief_m``: relief of the ground in those blocks, a plane taken off; null if unknown
+- ``metrics.probability``: probability of being within 5 degrees and 2 m of the truth, from a model fitted to
+  runs of known answer; null from keypoints
+- ``metrics.refinement_lost``: whether surfaces fit better where the tie points do not agree
 - ``metrics.refined_away_m``: how far the refinement moved the middle of the source
 - ``metrics.vertical_offset_m``: metres added to the source's heights, with vertical: estimate
 - ``metrics.yaw_deg``: yaw of the transform in the work frame, counter-clockwise from above

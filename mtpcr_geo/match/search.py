@@ -27,6 +27,8 @@ STEP_FLOOR = 0.02
 """Standard deviations below which an image shows nothing but noise: they bound the denominators."""
 FILLED = 0.5
 """Share of a turned cell that must come from filled cells for it to count as filled."""
+SPECTRAL_WINDOW = 5
+"""Shifts to either side from which a window is scored in the frequency domain."""
 
 
 @dataclass(frozen=True)
@@ -237,20 +239,13 @@ def score_nearby(
     warped = warp_to(source.channels.stack, source.grid, part, pose)
     inner = (slice(window, part.height - window), slice(window, part.width - window))
     mask = (warped[2] > FILLED).astype(np.float32)[inner]
-    step = max(1, int(mask.size / max_cells))
-    a, e = (warped[0][inner] * mask)[::step].ravel(), (warped[1][inner] * mask)[::step].ravel()
-    m = mask[::step].ravel()
     row0, column0 = offset
-    rows, columns = inner[0].stop - window, inner[1].stop - window
     stack = target.channels.stack[:, row0 : row0 + part.height, column0 : column0 + part.width]
-    sums = np.empty((7, side, side), np.float32)
-    aa, ee = a * a, e * e
-    for dy in range(side):
-        for dx in range(side):
-            A, E, M = (c.ravel() for c in stack[:, dy : dy + rows : step, dx : dx + columns])
-            mA, mE = m * A, m * E
-            sums[:, dy, dx] = (m @ M, a @ A, e @ E, aa @ M, ee @ M, mA @ A, mE @ E)
-    sums *= step
+    a, e = warped[0][inner] * mask, warped[1][inner] * mask
+    if window >= SPECTRAL_WINDOW:
+        sums = _sums_by_spectra(a, e, mask, stack, window)
+    else:
+        sums = _sums_by_shifts(a, e, mask, stack, window, max(1, int(mask.size / max_cells)))
     overlap = sums[0]
     score = correlation_score(overlap, (sums[1], sums[2]), (sums[3], sums[4]), (sums[5], sums[6]))
     best_dy, best_dx = divmod(int(np.argmax(score)), side)
@@ -263,6 +258,46 @@ def score_nearby(
         round(float(overlap[best_dy, best_dx])),
     )
     return best, score
+
+
+def _sums_by_shifts(a: Image, e: Image, m: Image, stack: Image, window: int, step: int) -> Image:
+    """Return the (7, n, n) sums that a score is made of, for each shift, from every ``step``-th row."""
+    rows, columns = m.shape
+    side = 2 * window + 1
+    a, e, m = a[::step].ravel(), e[::step].ravel(), m[::step].ravel()
+    sums = np.empty((7, side, side), np.float32)
+    aa, ee = a * a, e * e
+    for dy in range(side):
+        for dx in range(side):
+            A, E, M = (c.ravel() for c in stack[:, dy : dy + rows : step, dx : dx + columns])
+            mA, mE = m * A, m * E
+            sums[:, dy, dx] = (m @ M, a @ A, e @ E, aa @ M, ee @ M, mA @ A, mE @ E)
+    return np.asarray(sums * np.float32(step))
+
+
+def _sums_by_spectra(a: Image, e: Image, m: Image, stack: Image, window: int) -> Image:
+    """Return the same sums from all rows, by the correlation theorem: cheaper where there are many shifts."""
+    side = 2 * window + 1
+    shape = tuple(cv2.getOptimalDFTSize(n) for n in stack.shape[1:])
+
+    def spectrum(image: Image) -> Image:
+        padded = np.zeros(shape, np.float32)
+        padded[: image.shape[0], : image.shape[1]] = image
+        return np.asarray(cv2.dft(padded, nonzeroRows=image.shape[0]), np.float32)
+
+    A, E, M = stack
+    pairs = ((m, M), (a, A), (e, E), (a * a, M), (e * e, M), (m, A * A), (m, E * E))
+    known: dict[int, Image] = {}
+    sums = np.empty((7, side, side), np.float32)
+    for number, (one, other) in enumerate(pairs):
+        for image in (one, other):
+            if id(image) not in known:
+                known[id(image)] = spectrum(image)
+        product = cv2.mulSpectrums(known[id(other)], known[id(one)], 0, conjB=True)
+        sums[number] = cv2.idft(product, flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)[:side, :side]
+    # rounding leaves a trace where nothing overlaps
+    sums[0] = np.round(sums[0])
+    return sums
 
 
 def _target_under(source: Grid, target: Grid, pose: Pose, margin: int) -> tuple[Grid, tuple[int, int]]:

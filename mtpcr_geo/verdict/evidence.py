@@ -17,7 +17,7 @@ from mtpcr_geo.method.overlap import overlap_of
 from mtpcr_geo.method.scales import MAX_LEAST_OVERLAP_M2, ground_cell_for, scales_of, tolerance_for
 from mtpcr_geo.method.shortcomings import what_is_missing
 from mtpcr_geo.method.solve import solve_tie_points
-from mtpcr_geo.verdict.decision import Evidence
+from mtpcr_geo.verdict.limits import Evidence
 from mtpcr_geo.verdict.probability import TIE_POINTS_PER_PATCH
 
 GROUND_AGREES_M = 0.5

@@ -21,7 +21,7 @@ from mtpcr_geo.core.arrays import Floats
 FILE = "calibration.json"
 RATIOS = (0.2, 20.0)
 """Ratios of strengths beyond which they say no more."""
-GROUND_NOISE_M = 0.05
+RELIEF_NOISE_M = 0.05
 """Added to spread and relief of the ground: what is below it is noise."""
 GROUND_CLEAR = (-1.0, 2.5)
 GROUND_CELLS, GROUND_EXPECTED = 30, 0.7
@@ -58,7 +58,7 @@ def features_of(metrics: Mapping[str, Any]) -> Floats | None:
     spread, relief = metrics.get("ground_spread_m"), metrics.get("ground_relief_m")
     shape = 0.0
     if spread is not None and relief is not None:
-        shape = float(np.clip(np.log((relief + GROUND_NOISE_M) / (spread + GROUND_NOISE_M)), *GROUND_CLEAR))
+        shape = float(np.clip(np.log((relief + RELIEF_NOISE_M) / (spread + RELIEF_NOISE_M)), *GROUND_CLEAR))
     cells = metrics.get("ground_cells") or 0
     share = (metrics.get("ground_agreeing") or 0) / max(cells, 1) - GROUND_EXPECTED
     return np.array(
