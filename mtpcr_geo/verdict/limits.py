@@ -90,7 +90,7 @@ class Limits:
 
     """
 
-    probability: float = 0.95
+    probability: float = 0.9
     doubtful_probability: float = 0.5
     neg_log10_p: float = 6.0
     doubtful_neg_log10_p: float = 3.0

@@ -236,7 +236,7 @@ class AssessOptions(StageOptions):
         "for keypoint matchers",
     )
     probability: float = Field(
-        0.95,
+        0.9,
         ge=0,
         le=1,
         description="probability of being within 5 degrees and 2 m of the truth wanted to accept",

@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mtpcr_geo.benchmark.robustness.calibrate import calibrate, calibration_error, fit, reliability
+from mtpcr_geo.benchmark.robustness.results import RowFile
+from mtpcr_geo.core.errors import InputError
+from mtpcr_geo.verdict.probability import FEATURES
+
+
+def drawn(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    features = rng.normal(size=(count, 3))
+    odds = -0.5 + features @ np.array([2.0, 1.0, 0.0])
+    return features, rng.uniform(size=count) < 1.0 / (1.0 + np.exp(-odds))
+
+
+def test_the_fit_recovers_the_model_that_runs_were_drawn_from() -> None:
+    intercept, weights = fit(*drawn(20_000, 1))
+    assert intercept == pytest.approx(-0.5, abs=0.1)
+    assert weights == pytest.approx([2.0, 1.0, 0.0], abs=0.1)
+
+
+def test_no_weight_is_negative() -> None:
+    features, right = drawn(2_000, 2)
+    assert (fit(-features, right)[1] >= 0.0).all()
+
+
+def test_probabilities_that_are_true_have_no_calibration_error() -> None:
+    rng = np.random.default_rng(3)
+    said = rng.uniform(size=50_000)
+    lines = reliability(said, rng.uniform(size=len(said)) < said)
+    assert sum(line["runs"] for line in lines) == len(said)
+    assert calibration_error(lines) < 0.01
+    assert calibration_error(reliability(said, np.ones(len(said), bool))) > 0.4
+
+
+def rows_into(path: Path, count: int) -> Path:
+    rng = np.random.default_rng(4)
+    with RowFile(path) as file:
+        for number in range(count):
+            right = bool(rng.uniform() < 0.5)
+            strength = float(rng.lognormal(1.5 if right else 0.2, 0.4))
+            metrics: dict[str, Any] = {
+                "hypothesis_margin": strength, "null_ratio": strength, "neg_log10_p": 20.0 if right else 2.0,
+                "ground_cells": 100, "ground_agreeing": 95 if right else 60,
+            }  # fmt: skip
+            file.append(
+                {
+                    "case": str(number), "suite": "s", "site": f"site_{number % 8}", "has_truth": True,
+                    "right": right, "metrics": metrics,
+                }
+            )  # fmt: skip
+    return path
+
+
+def test_calibration_is_written_and_shown_on_other_sites(tmp_path: Path) -> None:
+    text = calibrate([rows_into(tmp_path / "robustness.csv", 400)], tmp_path / "out")
+    data = json.loads((tmp_path / "out" / "calibration.json").read_text("utf-8"))
+    assert set(data["weights"]) == set(FEATURES)
+    assert data["about"]["fitted_runs"] + data["about"]["shown_runs"] == 400
+    assert data["about"]["shown_calibration_error"] < 0.1
+    assert "expected calibration error" in text
+
+
+def test_too_few_runs_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="too few to calibrate"):
+        calibrate([rows_into(tmp_path / "robustness.csv", 20)], tmp_path / "out")

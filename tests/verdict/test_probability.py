@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mtpcr_geo.verdict.decision import Limits, assess, metrics_of
+from mtpcr_geo.verdict.limits import Evidence
+from mtpcr_geo.verdict.probability import FEATURES, features_of, probability_of, shipped
+
+CLEAR = Evidence(
+    held_out=40, held_out_agreeing=34, chance=0.06, tolerance_m=1.0, held_out_median_m=0.3, margin=6.0,
+    support=0.8, overlap_m2=9000.0, overlap_source=0.2, overlap_target=0.15, ground_cells=900,
+    ground_agreeing=890, refined_away_m=0.2, null_ratio=5.0, ground_spread_m=0.03, ground_relief_m=0.6,
+)  # fmt: skip
+
+
+def probability(**changes: object) -> float:
+    found = probability_of(metrics_of(replace(CLEAR, **changes)))  # type: ignore[arg-type]
+    assert found is not None
+    return found
+
+
+def test_clear_evidence_is_nearly_sure_and_accepted() -> None:
+    assert probability() > 0.99
+    verdict = assess(CLEAR, Limits())
+    assert verdict.name == "accepted"
+    assert "more than 99 %" in verdict.reasons[0]
+    assert verdict.metrics["probability"] == probability()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"margin": 1.5}, {"null_ratio": 1.2}, {"held_out_agreeing": 5}, {"ground_spread_m": 0.5},
+        {"ground_agreeing": 500}, {"refinement_lost": True},
+    ],
+)  # fmt: skip
+def test_weaker_evidence_never_raises_the_probability(changes: dict) -> None:
+    assert probability(**changes) <= probability()
+
+
+def test_no_piece_of_evidence_counts_against_a_pose() -> None:
+    model = shipped()
+    assert len(model.weights) == len(FEATURES)
+    assert min(model.weights) >= 0.0
+
+
+def test_what_unrelated_places_reach_is_refused_with_what_was_found() -> None:
+    weak = replace(
+        CLEAR, margin=1.4, null_ratio=1.4, held_out=12, held_out_agreeing=3, ground_spread_m=None,
+        ground_relief_m=None, ground_cells=10, ground_agreeing=5,
+    )  # fmt: skip
+    verdict = assess(weak, Limits())
+    assert verdict.name == "refused"
+    assert "3 of 12 held-out tie points" in verdict.reasons[0]
+    assert "wanted 90 %" in verdict.reasons[0]
+
+
+def test_without_a_mirrored_source_there_is_no_probability() -> None:
+    assert features_of(metrics_of(replace(CLEAR, null_ratio=None))) is None
+    verdict = assess(replace(CLEAR, null_ratio=None), Limits())
+    assert verdict.metrics["probability"] is None
+    assert verdict.name == "accepted"
+
+
+def test_another_place_with_the_same_rows_is_caught_by_the_shape_of_its_ground() -> None:
+    # an orchard elsewhere: everything fits but the terrain
+    rows = replace(
+        CLEAR, margin=14.9, null_ratio=13.6, held_out=324, held_out_agreeing=222, ground_cells=16089,
+        ground_agreeing=8190, ground_spread_m=0.78, ground_relief_m=0.57,
+    )  # fmt: skip
+    verdict = assess(rows, Limits())
+    assert verdict.name != "accepted"
+    assert any("differs in shape" in reason for reason in verdict.reasons)
+
+
+def test_features_are_bounded() -> None:
+    found = features_of(metrics_of(replace(CLEAR, margin=1e9, null_ratio=1e-9, ground_spread_m=0.0)))
+    assert found is not None
+    assert np.isfinite(found).all()
