@@ -11,12 +11,13 @@ import mtpcr_geo as mg
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.types import Bev, Hypothesis, Matches
 from mtpcr_geo.match.candidates import Candidate, Pool, same_pose
-from mtpcr_geo.match.correlation import CorrelationSettings, match, mirror
+from mtpcr_geo.match.correlation import CorrelationSettings, _Search, match, mirror
 from mtpcr_geo.match.pose import Pose
 from mtpcr_geo.match.prior import Prior
+from mtpcr_geo.match.search import _sums_by_shifts, _sums_by_spectra
 from mtpcr_geo.match.terrain import GroundComparison
 from mtpcr_geo.method.bev import grid_around, rasterise
-from mtpcr_geo.method.scales import Scales
+from mtpcr_geo.method.scales import Scales, scales_of
 
 
 def bev_of(xyz: np.ndarray, cell: float) -> Bev:
@@ -170,3 +171,73 @@ def test_poses_are_one_where_they_move_the_rim_alike() -> None:
     turned = Pose(np.radians(10.0), 1.0, 0.0)
     assert same_pose(here, turned, 5.0, 20.0)
     assert not same_pose(here, turned, 5.0, 200.0)
+
+
+def test_the_best_is_judged_at_the_finest_cells_though_a_first_look_was_enough_for_others() -> None:
+    rng = np.random.default_rng(5)
+    T_moved = moved_by(40.0)
+    source, target = town(rng, 60_000), town(rng, 60_000)
+    search = _Search(
+        bev_of(transforms.apply(T_moved, source), 1.0), bev_of(target, 1.0),
+        scales_of(bev_of(source, 1.0), bev_of(target, 1.0)), CorrelationSettings(), 0, lambda n: None,
+    )  # fmt: skip
+    search.explore(4, 0)
+    best = search.pool.candidates[0]
+    # seen beside something far stronger it is left after the first look, on cells twice as large
+    faint = search.judge.judge_one(best.pose, known=1e9)
+    assert not faint.complete
+    search.judged = [faint]
+    search._rank(0.0)
+    again = search.pool.candidates[0]
+    assert again.complete
+    assert again.patches is not None
+    assert best.patches is not None
+    assert np.ptp(again.patches.source_px, axis=0) == pytest.approx(
+        np.ptp(best.patches.source_px, axis=0), abs=2.0
+    )
+
+
+def test_tie_points_lie_where_the_best_hypothesis_puts_them() -> None:
+    rng = np.random.default_rng(2)
+    source = bev_of(planting(rng, (16.0, -40.0), (86.0, 40.0)), 1.0)
+    target = bev_of(planting(rng, (-40.0, -40.0), (40.0, 40.0)), 1.0)
+    found = match(source, target)
+    placed = transforms.apply(
+        transform_of(found.hypotheses[0]),
+        np.column_stack([source.grid.to_metres(found.source_px), np.zeros(len(found.source_px))]),
+    )[:, :2]
+    assert found.search_radius_m is not None
+    away = np.abs(placed - target.grid.to_metres(found.target_px)).max(axis=1)
+    assert np.median(away) <= found.search_radius_m + 1.0
+
+
+def test_the_ground_weighs_in_a_pose_and_in_its_mirror_image_alike() -> None:
+    def pool(strength: float, spread: float) -> Pool:
+        candidate = _Strong(Pose(0.0, 0.0, 0.0, strength, 100), ground=GroundComparison(100, spread))
+        return Pool((candidate,), (strength,))
+
+    alike = pool(10.0, 0.02).over(pool(12.0, 0.02))
+    assert alike == pytest.approx(10.0 / 12.0)
+    assert pool(10.0, 0.02).over(pool(12.0, 0.5)) > 5.0
+    assert pool(10.0, 0.5).over(pool(12.0, 0.02)) < 0.2
+    # and of flat ground, which is alike everywhere, nothing is made
+    assert pool(10.0, 0.0).over(pool(12.0, 0.01)) == pytest.approx(alike, rel=0.05)
+
+
+class _Strong(Candidate):
+    """A candidate whose patches all agree, so that its strength is its score."""
+
+    @property
+    def strength(self) -> float:
+        return self.pose.score
+
+
+def test_sums_by_spectra_are_those_by_shifts() -> None:
+    rng = np.random.default_rng(7)
+    a, e = rng.normal(size=(2, 40, 33)).astype(np.float32)
+    m = (rng.uniform(size=(40, 33)) < 0.8).astype(np.float32)
+    A, E = rng.normal(size=(2, 56, 49)).astype(np.float32)
+    M = (rng.uniform(size=(56, 49)) < 0.8).astype(np.float32)
+    stack = np.stack([A * M, E * M, M])
+    expected = _sums_by_shifts(a * m, e * m, m, stack, 8, 1)
+    assert _sums_by_spectra(a * m, e * m, m, stack, 8) == pytest.approx(expected, abs=1e-2)

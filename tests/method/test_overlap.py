@@ -82,3 +82,20 @@ def test_empty_cells_have_no_ground() -> None:
     assert (ground[filled] >= bev.low[filled] - 1e-6).all()
     _, step = overlap_of(xyz, xyz + [500.0, 0.0, 0.0]).ground_steps()
     assert len(step) == 0
+
+
+def test_grounds_of_one_place_have_one_shape_and_of_two_places_have_not() -> None:
+    source, target = hillside(1, 0.1), hillside(2, 0.1)
+    same = overlap_of(source, target).common_ground().shape()
+    assert same.blocks > 50
+    assert same.spread_m < 0.05
+    assert same.relief_m > 5 * same.spread_m
+    # the slope falls alike everywhere, and is no sign of one place: what rolls on it is
+    moved = source + [31.0, 17.0, 3.1]
+    other = overlap_of(moved, target).common_ground().shape()
+    assert other.spread_m > 0.7 * other.relief_m
+
+
+def test_too_little_ground_has_no_shape() -> None:
+    few = hillside(3, 0.0, 200, 8.0)
+    assert not np.isfinite(overlap_of(few, few).common_ground().shape().spread_m)
