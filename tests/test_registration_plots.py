@@ -41,6 +41,7 @@ def test_a_scan_is_found_in_an_airborne_cloud_of_the_plot() -> None:
     assert off(found.T_target_source, T_moved) < 0.05
 
 
+@pytest.mark.slow
 def test_a_plot_of_other_trees_is_never_accepted() -> None:
     rng = np.random.default_rng(10)
     target = plot(rng, 36.0, 40.0)

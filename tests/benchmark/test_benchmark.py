@@ -163,6 +163,7 @@ def test_options_of_a_method():
     assert methods.options_of("a") == {}
 
 
+@pytest.mark.slow
 def test_ours_answers_with_a_verdict(clouds):
     source, target, T_true = clouds
     answer = methods.make_method("mtpcr-geo").estimate(source, target, seed=0)

@@ -264,6 +264,7 @@ def pair(tmp_path_factory) -> tuple[Path, np.ndarray, Path]:
     return folder, open_cloud(folder / "source.laz").to_array(), folder / "target.laz"
 
 
+@pytest.mark.slow
 def test_a_registration_from_any_format_is_that_of_the_laz(pair, tmp_path, monkeypatch):
     folder, xyz, target = pair
     plain = mg.register(folder / "source.laz", target, local=True)

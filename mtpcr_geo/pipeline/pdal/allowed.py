@@ -173,7 +173,7 @@ _OPTIONS = {
         "a_srs compression discard_high_return_numbers extra_dims forward filesource_id major_version "
         "minor_version dataformat_id format global_encoding project_id system_id software_id creation_doy "
         "creation_year pdal_metadata scale_x scale_y scale_z offset_x offset_y offset_z vlrs "
-        "enhanced_srs_vlrs threads"
+        "enhanced_srs_vlrs threads spatialreference"
     ),
     "writers.null": "",
     "writers.ogr": "multicount measure_dim attr_dims ogrdriver ogr_options",
