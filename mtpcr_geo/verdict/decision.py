@@ -16,7 +16,8 @@ from mtpcr_geo.verdict.findings import (
     FEWEST_GROUND_CELLS,
     against_others,
     agreement,
-    chance,
+    chance_text,
+    few_finding,
     ground_checked,
     ground_finding,
     ground_shape_finding,
@@ -52,6 +53,7 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
         judged = probability_finding(evidence, limits, probability)
         weak = False  # the probability weighs the evidence together already
     findings = [
+        few_finding(evidence),
         judged,
         margin_finding(evidence, limits),
         null_finding(evidence, limits),
@@ -99,7 +101,7 @@ def metrics_of(evidence: Evidence) -> dict[str, Any]:
 
 def _grounds(evidence: Evidence, probability: float | None) -> list[str]:
     """Return what an acceptance rests on."""
-    grounds = [] if probability is None else [f"the pose is right with {chance(probability)}"]
+    grounds = [] if probability is None else [f"the pose is right with {chance_text(probability)}"]
     grounds.append(agreement(evidence))
     grounds += against_others(evidence)
     return [

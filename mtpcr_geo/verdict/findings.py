@@ -65,7 +65,7 @@ def _times(ratio: float, below: str, above: str) -> str:
     return f"{ratio:.1f} times {below}" if ratio >= 1.0 else f"{1.0 / max(ratio, 0.01):.1f} times {above}"
 
 
-def chance(probability: float) -> str:
+def chance_text(probability: float) -> str:
     """Say a probability; what is nearly sure is said as such, since no run could show more digits."""
     return "a probability of more than 99 %" if probability > 0.99 else f"a probability of {probability:.0%}"
 
@@ -79,15 +79,22 @@ def _for_more_evidence(evidence: Evidence) -> str:
     return _OTHER_PLACES
 
 
+def few_finding(evidence: Evidence) -> CheckFinding | None:
+    """Judge whether there are tie points enough to check a result by at all."""
+    if evidence.held_out >= FEWEST_HELD_OUT:
+        return None
+    return CheckFinding(
+        f"{only(evidence.held_out, 'tie point')} found, too few to check the result by (wanted "
+        f"{FEWEST_HELD_OUT}); {_for_more_tie_points(evidence)}"
+    )
+
+
 def held_out_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
-    """Judge how many held-out tie points agree, and whether they are enough to tell."""
+    """Judge whether as many held-out tie points agree as chance would not give."""
+    if evidence.held_out < FEWEST_HELD_OUT:
+        return None
     digits = neg_log10_p_of(evidence)
     share = evidence.held_out_agreeing / max(evidence.held_out, 1)
-    if evidence.held_out < FEWEST_HELD_OUT:
-        return CheckFinding(
-            f"{only(evidence.held_out, 'tie point')} found, too few to check the result by (wanted "
-            f"{FEWEST_HELD_OUT}); {_for_more_tie_points(evidence)}"
-        )
     reached, wanted = beside(digits, limits.neg_log10_p, 1)
     if digits < limits.neg_log10_p and best_neg_log10_p(evidence) < limits.neg_log10_p:
         return CheckFinding(

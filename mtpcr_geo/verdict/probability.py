@@ -24,7 +24,7 @@ RATIOS = (0.2, 20.0)
 RELIEF_NOISE_M = 0.05
 """Added to spread and relief of the ground: what is below it is noise."""
 GROUND_CLEAR = (-1.0, 2.5)
-GROUND_CELLS, GROUND_EXPECTED = 30, 0.7
+GROUND_EXPECTED = 0.7
 TIE_POINTS_PER_PATCH = 4
 """Patches overlap by half, so about four tie points tell what one independent tie would."""
 
@@ -67,7 +67,7 @@ def features_of(metrics: Mapping[str, Any]) -> Floats | None:
             np.log(np.clip(null, *RATIOS)),
             np.log1p(significance / TIE_POINTS_PER_PATCH),
             shape,
-            share if cells >= GROUND_CELLS else 0.0,
+            share if metrics.get("ground_checked") else 0.0,
             -1.0 if metrics.get("refinement_lost") else 0.0,
         ]
     )

@@ -48,7 +48,7 @@ def rows_into(path: Path, count: int) -> Path:
             strength = float(rng.lognormal(1.5 if right else 0.2, 0.4))
             metrics: dict[str, Any] = {
                 "hypothesis_margin": strength, "null_ratio": strength, "neg_log10_p": 20.0 if right else 2.0,
-                "ground_cells": 100, "ground_agreeing": 95 if right else 60,
+                "ground_cells": 100, "ground_checked": True, "ground_agreeing": 95 if right else 60,
             }  # fmt: skip
             file.append(
                 {

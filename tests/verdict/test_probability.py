@@ -76,6 +76,12 @@ def test_another_place_with_the_same_rows_is_caught_by_the_shape_of_its_ground()
     assert any("differs in shape" in reason for reason in verdict.reasons)
 
 
+def test_too_few_tie_points_are_never_accepted_however_clear_the_rest() -> None:
+    verdict = assess(replace(CLEAR, margin=20.0, null_ratio=20.0, held_out=3, held_out_agreeing=3), Limits())
+    assert verdict.name == "doubtful"
+    assert any("too few to check the result by" in reason for reason in verdict.reasons)
+
+
 def test_features_are_bounded() -> None:
     found = features_of(metrics_of(replace(CLEAR, margin=1e9, null_ratio=1e-9, ground_spread_m=0.0)))
     assert found is not None
