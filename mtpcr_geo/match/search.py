@@ -231,7 +231,7 @@ def score_nearby(
         max_cells: of larger parts only every n-th row is compared, for an estimate.
 
     """
-    part, offset = _target_under(source.grid, target.grid, pose, window)
+    part, offset = target_under(source.grid, target.grid, pose, window)
     side = 2 * window + 1
     nothing = np.full((side, side), -np.inf, np.float32)
     if part.width <= 2 * window or part.height <= 2 * window:
@@ -300,7 +300,7 @@ def _sums_by_spectra(a: Image, e: Image, m: Image, stack: Image, window: int) ->
     return sums
 
 
-def _target_under(source: Grid, target: Grid, pose: Pose, margin: int) -> tuple[Grid, tuple[int, int]]:
+def target_under(source: Grid, target: Grid, pose: Pose, margin: int) -> tuple[Grid, tuple[int, int]]:
     """Cut from the target's grid what the posed source can reach, plus a margin of cells."""
     half_w, half_h = source.width * source.cell / 2, source.height * source.cell / 2
     corners = np.array([[-half_w, -half_h], [half_w, -half_h], [half_w, half_h], [-half_w, half_h]])

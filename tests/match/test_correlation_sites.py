@@ -11,7 +11,8 @@ import mtpcr_geo as mg
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.types import Bev, Hypothesis, Matches
 from mtpcr_geo.match.candidates import Candidate, Pool, same_pose
-from mtpcr_geo.match.correlation import CorrelationSettings, _Search, match, mirror
+from mtpcr_geo.match.correlation import CorrelationSettings, match, mirror
+from mtpcr_geo.match.exploration import Exploration, Step
 from mtpcr_geo.match.pose import Pose
 from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.search import _sums_by_shifts, _sums_by_spectra
@@ -177,11 +178,11 @@ def test_the_best_is_judged_at_the_finest_cells_though_a_first_look_was_enough_f
     rng = np.random.default_rng(5)
     T_moved = moved_by(40.0)
     source, target = town(rng, 60_000), town(rng, 60_000)
-    search = _Search(
+    search = Exploration(
         bev_of(transforms.apply(T_moved, source), 1.0), bev_of(target, 1.0),
         scales_of(bev_of(source, 1.0), bev_of(target, 1.0)), CorrelationSettings(), 0, lambda n: None,
     )  # fmt: skip
-    search.explore(4, 0)
+    search.explore(Step(4, 0))
     best = search.pool.candidates[0]
     # seen beside something far stronger it is left after the first look, on cells twice as large
     faint = search.judge.judge_one(best.pose, known=1e9)
