@@ -152,6 +152,7 @@ class IcpResult(ComparesArrays):
         rotated_deg: angle by which it turned the start, degrees; None where none was followed.
         fine: the last round at a finer thinning, where the density bears one.
         fine_voxel_m: that thinning, metres.
+        T_surfaces: 4x4 of the run under which surfaces meet best, whether it was followed or not.
 
     """
 
@@ -168,6 +169,7 @@ class IcpResult(ComparesArrays):
     rotated_deg: float | None = None
     fine: IcpRound | None = None
     fine_voxel_m: float | None = None
+    T_surfaces: Floats | None = None
 
     def audit(self) -> dict[str, Any]:
         """Return the figures of the runs, for the audit."""

@@ -45,11 +45,13 @@ class Rounds:
         trim_m: distance within which a point of the source must have a partner at the start to take part in
             all rounds but the last, metres; None takes all. What grew or was built in between is left
             out by it; the last round takes all, so that the result does not depend on the start.
+        slack: times the usual step below which the last round stands still.
 
     """
 
     max_correspondence_distances_m: tuple[float, ...]
     trim_m: float | None = None
+    slack: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,7 @@ class Surfaces:
         for number, distance in enumerate(distances, 1):
             # what a round leaves is taken up by the next; only the last must stand still
             last = number == len(distances)
-            slack = 1.0 if last else 25.0
+            slack = rounds.slack if last else 25.0
             result = small_gicp.align(
                 self._target,
                 self._source if last else trimmed,

@@ -29,6 +29,8 @@ FINE_BELOW = 0.75
 """Share of the thinning before below which a last, finer round is worth its time."""
 FINE_DISTANCE_VOXELS = 2.0
 FINE_POINTS = 2
+FINE_SLACK = 5.0
+"""Times the usual step below which the fine round stands still: its many points trade partners for ever."""
 SAME_FIT = 1.02
 """Times that the surface residual may grow where the height is taken from the ground after ICP."""
 BETWEEN = "between"
@@ -133,6 +135,7 @@ def inverse_of(refinement: Refinement) -> Refinement:
             T=transforms.inverse(icp.T),
             points_source=icp.points_target,
             points_target=icp.points_source,
+            T_surfaces=None if icp.T_surfaces is None else transforms.inverse(icp.T_surfaces),
         )
     before = transforms.inverse(refinement.T_before)
     return Refinement(transforms.inverse(refinement.T), before, ground[0], icp, ground[1])
@@ -223,7 +226,7 @@ def _refined_finely(
         max_points=FINE_POINTS * settings.max_points,
     )
     run = surfaces.descend(
-        T_start, Rounds((distance,)), method=settings.method, iterations=settings.iterations
+        T_start, Rounds((distance,), slack=FINE_SLACK), method=settings.method, iterations=settings.iterations
     )
     if surfaces.surface_residual(run.T) >= surfaces.surface_residual(T_start):
         return None
@@ -322,6 +325,7 @@ def follow_icp(
         lost_tie_points=bool(lost),
         rounds=run.rounds if run is not None else (),
         rotated_deg=rotated,
+        T_surfaces=min(runs.items(), key=lambda one: trials[one[0]].surface_residual)[1].T,
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import RegistrationError
-from mtpcr_geo.core.types import Bev, Levelling, Pair, Side
+from mtpcr_geo.core.types import Bev, Levelling, Pair, Refinement, Side
 from mtpcr_geo.method.inverse_mapping import tie_points_of
 from mtpcr_geo.method.refine import RefineSettings, refine
 from mtpcr_geo.method.scales import tolerance_for
@@ -54,11 +54,14 @@ def tilt_between_deg(pair: Pair, T_target_source: Floats) -> float:
     return float(np.degrees(transforms.rotation_angle(transforms.yaw_matrix(transforms.yaw_of(R)).T @ R)))
 
 
-def fed_back(pair: Pair, settings: RefineSettings, rasterise: Callable[[Side, float], Bev]) -> Pair | None:
+def fed_back(
+    pair: Pair, refined: Refinement, settings: RefineSettings, rasterise: Callable[[Side, float], Bev]
+) -> Pair | None:
     """Level the source by what ICP finds without regard to the tie points, and register again from there.
 
     Args:
         pair: solved, with matches and rasters; not both verticals are known.
+        refined: what the refinement came to.
         settings: of the refinement.
         rasterise: makes the raster of a side at a cell, metres.
 
@@ -72,17 +75,12 @@ def fed_back(pair: Pair, settings: RefineSettings, rasterise: Callable[[Side, fl
         return None
     if settings.method is None or settings.motion != "rigid" or settings.keep_tie_points == 0:
         return None
-    free = refine(
-        pair.source.sample,
-        pair.target.sample,
-        pair.T_target_source,
-        replace(settings, keep_tie_points=0.0),
-        cell=pair.cell,
-    )
-    tilt = tilt_between_deg(pair, free.T)
-    if not LEAST_TILT_DEG <= tilt <= MOST_TILT_DEG:
+    # what the surfaces say without regard to the tie points
+    icp = refined.icp
+    free = None if icp is None else icp.T if icp.followed else icp.T_surfaces
+    if free is None or not LEAST_TILT_DEG <= tilt_between_deg(pair, free) <= MOST_TILT_DEG:
         return None
-    side = replace(pair.source, levelling=levelled_by(pair, free.T), bev=None, appearance=None)
+    side = replace(pair.source, levelling=levelled_by(pair, free), bev=None, appearance=None)
     again = pair.with_(source=replace(side, bev=rasterise(side, source.grid.cell)), refinement=None)
     try:
         again = _solved(again, pair)

@@ -208,7 +208,9 @@ class Refine(Stage):
         self.metadata |= refinement.audit()
         trusted = pair.source.levelling.trusted and pair.target.levelling.trusted
         if not trusted and options.feedback:
-            again = fed_back(pair, settings, lambda side, cell: rasterised(side, cell, "centre", context))
+            again = fed_back(
+                pair, refinement, settings, lambda side, cell: rasterised(side, cell, "centre", context)
+            )
             if again is not None and again.refinement is not None:
                 tilt = again.source.levelling.tilt_deg
                 self.metadata |= {"levelled_again": True, "tilt_deg": tilt, **again.refinement.audit()}
