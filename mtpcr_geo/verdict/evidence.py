@@ -17,8 +17,8 @@ from mtpcr_geo.method.overlap import overlap_of
 from mtpcr_geo.method.scales import MAX_LEAST_OVERLAP_M2, ground_cell_for, scales_of, tolerance_for
 from mtpcr_geo.method.shortcomings import what_is_missing
 from mtpcr_geo.method.solve import solve_tie_points
+from mtpcr_geo.verdict.further import with_further
 from mtpcr_geo.verdict.limits import Evidence
-from mtpcr_geo.verdict.probability import TIE_POINTS_PER_PATCH
 
 GROUND_AGREES_M = 0.5
 UNBOUNDED_CELLS = 2.0
@@ -87,6 +87,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
             if side.levelling.method == "none" and not side.levelling.trusted
         ),
     )
+    evidence, further = with_further(evidence, pair, overlap, ground, tie_points, agreeing)
     shift = T[:3, 3]
     offset = TransformChain.of(pair).vertical_offset_m
     more = {
@@ -96,12 +97,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         "shift_work_m": [float(v) for v in shift],
         "tie_points": len(tie_points.score),
         "tie_points_agreeing": int((residual < tolerance).sum()),
-        **_uncertainty(
-            tie_points,
-            residual,
-            tolerance,
-            transforms.apply(T_level, pair.source.levelled_sample.mean(axis=0)[None])[0],
-        ),
+        **further,
     }
     return evidence, more
 
@@ -212,34 +208,3 @@ def _refined_away(pair: Pair, T: Floats) -> float:
     )
     moved = transforms.apply(T, middle)[0] - transforms.apply(before, middle)[0]
     return float(np.hypot(*(pair.target.T_level_work[:3, :3] @ moved)[:2]))
-
-
-def _uncertainty(
-    tie_points: TiePoints, residual: Floats, tolerance: float, centroid: Floats
-) -> dict[str, Any]:
-    """One standard deviation of yaw and plan position, from the scatter and spread of the tie points.
-
-    Args:
-        tie_points: all tie points.
-        residual: (n,) their plan residuals, metres.
-        tolerance: within which a tie point agrees, metres.
-        centroid: (3,) where the source's centroid comes to lie, in the target's levelled frame.
-
-    """
-    near = residual < 2.5 * tolerance
-    if near.sum() < 6:
-        return {"sigma_yaw_deg": None, "sigma_plan_m": None, "sigma_plan_source_centroid_m": None}
-    xy = tie_points.target[near, :2]
-    # a Rayleigh median is 1.1774 standard deviations of one coordinate
-    scatter = float(np.median(residual[near])) / 1.1774
-    independent = max(float(near.sum()) / TIE_POINTS_PER_PATCH, 1.5)
-    middle = xy.mean(axis=0)
-    arm = max(float(np.sqrt(((xy - middle) ** 2).sum(axis=1).mean())), 1.0)
-    plan = scatter / np.sqrt(independent)
-    yaw = plan / arm
-    lever = float(np.linalg.norm(centroid[:2] - middle))
-    return {
-        "sigma_yaw_deg": float(np.degrees(yaw)),
-        "sigma_plan_m": float(plan),
-        "sigma_plan_source_centroid_m": float(np.hypot(plan, yaw * lever)),
-    }
