@@ -17,7 +17,7 @@ from mtpcr_geo.verdict.findings import (
     FEWEST_GROUND_CELLS,
     CheckFinding,
     against_others,
-    agreement,
+    agreement_beyond_chance,
     chance_text,
     few_finding,
     ground_checked,
@@ -115,7 +115,7 @@ def metrics_of(evidence: Evidence) -> dict[str, Any]:
 def _grounds(evidence: Evidence, probability: float | None) -> list[str]:
     """Return what an acceptance rests on."""
     grounds = [] if probability is None else [f"the pose is right with {chance_text(probability)}"]
-    grounds.append(agreement(evidence))
+    grounds.append(agreement_beyond_chance(evidence))
     grounds += against_others(evidence)
     return [
         *grounds,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.statistics import chance_within
 from mtpcr_geo.core.types import Hypothesis, Pair, Rival, SolveSettings, TiePoints
@@ -97,9 +97,27 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         "shift_work_m": [float(v) for v in shift],
         "tie_points": len(tie_points.score),
         "tie_points_agreeing": int((residual < tolerance).sum()),
+        **_agreeing_heights(pair, residual < tolerance),
+        "held_out_expected": None if evidence.chance is None else evidence.chance * evidence.held_out,
         **further,
     }
     return evidence, more
+
+
+def _agreeing_heights(pair: Pair, agreeing: Mask) -> dict[str, Any]:
+    """Return how the tie points that agree in plan compare in height, which they are not matched by."""
+    names = (
+        "tie_points_plan_median_m", "tie_points_height_median_m", "tie_points_height_off",
+        "tie_points_height_tolerance_m",
+    )  # fmt: skip
+    if pair.tie_points is None or pair.T_target_source is None or not agreeing.any():
+        return dict.fromkeys(names)
+    T = pair.levelled(pair.T_target_source)
+    gap = (transforms.apply(T, pair.tie_points.source) - pair.tie_points.target)[agreeing]
+    rise = np.abs(gap[:, 2] - np.median(gap[:, 2]))
+    most = max(3.0 * 1.4826 * float(np.median(rise)), tolerance_for(pair.cell))
+    plan, height = np.median(np.hypot(gap[:, 0], gap[:, 1])), np.median(np.abs(gap[:, 2]))
+    return dict(zip(names, (float(plan), float(height), int((rise > most).sum()), most), strict=True))
 
 
 def rivals_of(pair: Pair, tolerance: float) -> tuple[Rival, ...]:
@@ -162,11 +180,16 @@ def agreement(pair: Pair, T: Floats, tolerance: float | None = None) -> tuple[in
 
 def tie_points_agreeing(pair: Pair, T: Floats, tolerance: float | None = None) -> int:
     """Count the tie points that a transform brings together in plan; arguments as for `agreement`."""
+    return int(tie_point_agrees(pair, T, tolerance).sum())
+
+
+def tie_point_agrees(pair: Pair, T: Floats, tolerance: float | None = None) -> Mask:
+    """Return which tie points (n,) a transform brings together in plan; arguments as for `agreement`."""
     if pair.tie_points is None:
-        return 0
+        return np.zeros(0, bool)
     T_level = pair.levelled(T)
     gap = transforms.apply(T_level, pair.tie_points.source) - pair.tie_points.target
-    return int((np.hypot(gap[:, 0], gap[:, 1]) < (tolerance or tolerance_for(pair.cell))).sum())
+    return np.asarray(np.hypot(gap[:, 0], gap[:, 1]) < (tolerance or tolerance_for(pair.cell)))
 
 
 def cross_validated(tie_points: TiePoints, tolerance: float, settings: SolveSettings) -> Floats:

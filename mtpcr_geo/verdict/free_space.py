@@ -15,7 +15,7 @@ SOLID_ABOVE_M = 2.5
 """Metres above the ground from which a cell without anything lower counts as solid: a storey."""
 INSIDE_CELLS = 1
 """Cells by which a solid is shrunk, so that eaves and half a cell of misfit are no conflict."""
-FLAT_M = 1.0
+FLAT_M = 3.0
 """Most spread of heights in a solid cell, rise within it: a roof, and no crown."""
 FEWEST_CELLS = 20
 

@@ -145,11 +145,13 @@ def _floor(equations: BlockEquations, pair: Pair, ground: CommonGround) -> Float
     off = equations.centres - equations.pivot
     arm = max(float(np.sqrt((off[:, :2] ** 2).sum(axis=1).mean())), 1e-3)
     plan = GAP_FLOOR * equations.gap_m
-    height = float(np.hypot(HEIGHT_FLOOR * plan, _height_noise(pair, ground)))
-    return np.diag([(height / arm) ** 2] * 2 + [(plan / arm) ** 2] + [plan**2] * 2 + [height**2])
+    noise, differ = _height_noise(pair, ground)
+    uneven = float(np.hypot(HEIGHT_FLOOR * plan, noise))
+    height = float(np.hypot(uneven, differ))
+    return np.diag([(uneven / arm) ** 2] * 2 + [(plan / arm) ** 2] + [plan**2] * 2 + [height**2])
 
 
-def _height_noise(pair: Pair, ground: CommonGround) -> float:
+def _height_noise(pair: Pair, ground: CommonGround) -> tuple[float, float]:
     """Return how well the ground tells the height, and how far the fit and the ground differ, metres."""
     noise = 0.0
     if len(ground.step) >= FEWEST_GROUND:
@@ -158,8 +160,8 @@ def _height_noise(pair: Pair, ground: CommonGround) -> float:
             noise = shape.spread_m / float(np.sqrt(shape.blocks))
     settled = pair.refinement.ground_after if pair.refinement is not None else None
     if settled is not None and settled.rise_m is not None:
-        noise = float(np.hypot(noise, settled.rise_m))
-    return noise
+        return noise, abs(settled.rise_m)
+    return noise, 0.0
 
 
 def equations_of_tie_points(
