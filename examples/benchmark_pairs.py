@@ -173,7 +173,7 @@ def run(source: Path, target: Path, options: list[str], out: Path) -> dict[str, 
             "margin": judged.get("hypothesis_margin"),
             "held_out": judged.get("held_out_tie_points"),
             "held_out_agreeing": judged.get("held_out_agreeing"),
-            "sigma_plan_m": judged.get("sigma_plan_source_centroid_m"),
+            "sigma_plan_m": judged.get("sigma_plan_far_m"),
         }
     if (out / "transform.json").exists():
         row["T_target_source"] = np.array(json.loads((out / "transform.json").read_text())["T_target_source"])

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
 import tempfile
@@ -24,9 +23,10 @@ from mtpcr_geo.core.cloud import ArrayCloud, Cloud
 from mtpcr_geo.core.errors import InputError, MissingPartError, OptionError, RegistrationError
 from mtpcr_geo.core.progress import Progress
 from mtpcr_geo.core.types import Floats, Pair, Verdict
+from mtpcr_geo.core.uncertainty import Uncertainty
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.export.apply import move, moved_by, write_moved
-from mtpcr_geo.io.memory import cloud_of, is_array
+from mtpcr_geo.io.memory import cloud_of, coordinates, is_array
 from mtpcr_geo.pipeline.options import OUTPUT_NAMES, RegisterOptions, first_problem
 from mtpcr_geo.pipeline.records import StageRecord
 from mtpcr_geo.pipeline.runner import RunResult, run
@@ -96,6 +96,30 @@ class Registration:
         """4x4 from target to source, the inverse of `T_target_source`."""
         T = self.T_target_source
         return None if T is None else np.asarray(np.linalg.inv(T), np.float64)
+
+    @property
+    def uncertainty(self) -> Uncertainty | None:
+        """Covariance of the error of the pose about a stated pivot; None where too little agrees to tell."""
+        return self.verdict.uncertainty
+
+    def expected_error(self, points: ArrayLike) -> tuple[Floats, Floats]:
+        """Return the expected error over the source's extent.
+
+        Args:
+            points: (n, 3) coordinates in the source's CRS and units.
+
+        Returns:
+            Standard deviation of where each comes to lie, in plan along the direction in which it is largest
+            and in height: (n,) and (n,) metres.
+
+        Raises:
+            RegistrationError: if no transform was found, or its uncertainty is not known.
+
+        """
+        if self._chain is None or self.pair is None or self.uncertainty is None:
+            raise RegistrationError(f"the expected error is not known: {'; '.join(self.verdict.reasons)}")
+        work = self._chain.source.to_work(coordinates(points, "points"))
+        return self.uncertainty.sigmas(transforms.apply(self._chain.T_target_source, work))
 
     @overload
     def apply(self, points: str | os.PathLike[str] | Cloud, *, force: bool = ...) -> Cloud: ...  # type: ignore[overload-overlap]
@@ -221,7 +245,7 @@ class Registration:
     def __repr__(self) -> str:
         rows = self._rows()
         width = max((len(name) for name, _ in rows), default=0)
-        lines = [f"Registration: {self.verdict.name}"]
+        lines = [f"Registration: {self.verdict.name}", f"  {self.verdict.headline}"]
         return "\n".join(lines + [f"  {name:<{width}}  {text}" for name, text in rows])
 
     def _repr_html_(self) -> str:
@@ -230,24 +254,14 @@ class Registration:
             f"<td style='text-align:left'>{escape(text)}</td></tr>"
             for name, text in self._rows()
         )
-        return f"<div><b>Registration: {escape(self.verdict.name)}</b><table>{rows}</table></div>"
+        head = f"<b>Registration: {escape(self.verdict.name)}</b><p>{escape(self.verdict.headline)}</p>"
+        return f"<div>{head}<table>{rows}</table></div>"
 
     def _rows(self) -> list[tuple[str, str]]:
         """Return clouds, transform, overlap and reasons of the verdict, as (name, text)."""
-        rows = []
-        if self.pair is not None:
-            names = (Path(side.cloud.name).name for side in (self.pair.source, self.pair.target))
-            rows.append(("clouds", " to ".join(names)))
-            if self.pair.T_target_source is not None:
-                rows.append(("transform", _transform_text(self.pair)))
-        overlap = self.verdict.metrics.get("overlap_m2")
-        if overlap is not None:
-            shares = [
-                f"{self.verdict.metrics[f'overlap_{role}']:.0%} of the {role}"
-                for role in ("source", "target")
-            ]
-            rows.append(("overlap", f"{overlap:,.0f} m², {' and '.join(shares)}"))
-        return rows + [("reason", reason) for reason in self.verdict.reasons[:2]]
+        from mtpcr_geo.export.descriptions import registration_rows
+
+        return registration_rows(self.pair, self.verdict)
 
     @cached_property
     def _chain(self) -> TransformChain | None:
@@ -433,16 +447,3 @@ def _name_of(path: Path) -> str:
 
 def _is_part(path: Path) -> bool:
     return path.parent.name == "registered"
-
-
-def _transform_text(pair: Pair) -> str:
-    """Describe the transform in one line."""
-    from mtpcr_geo.export.descriptions import shift_text
-
-    assert pair.T_target_source is not None
-    R = pair.T_target_source[:3, :3]
-    yaw = transforms.yaw_of(R)
-    tilt = math.degrees(transforms.rotation_angle(transforms.yaw_matrix(yaw).T @ R))
-    shift = shift_text(pair)
-    text = f"yaw {math.degrees(yaw):+.3f}°, tilt {tilt:.3f}°"
-    return f"{text}, the middle moves by {shift}" if shift else text

@@ -27,9 +27,10 @@ _SHOWN = (
     "held_out_agreeing_share",
     "held_out_median_m",
     "hypothesis_margin",
-    "sigma_yaw_deg",
-    "sigma_plan_source_centroid_m",
+    "sigma_plan_m",
     "sigma_height_m",
+    "sigma_yaw_deg",
+    "sigma_tilt_deg",
 )
 _OPEN_WITH = {
     "registered": "the moved cloud",
@@ -48,7 +49,7 @@ def print_registration(
     console: Console | None = None,
     force_with: str = "--force writes it all the same",
 ) -> None:
-    """Print verdict, reasons, the transform in words, the checks, and which files to open.
+    """Print the verdict in a sentence, its reasons, the transform in words, and which files to open.
 
     Args:
         result: what a registration came to.
@@ -63,7 +64,8 @@ def print_registration(
 
     console = console or _stdout()
     name = result.verdict.name
-    console.print(Text(name.upper(), _COLOUR[name]))
+    head, _, rest = result.verdict.headline.partition(":")
+    console.print(Text.assemble((f"{head}:", _COLOUR[name]), rest), soft_wrap=True)
     for reason in result.verdict.reasons:
         console.print(Text(f"  {reason}"), soft_wrap=True)
     facts = Table(box=None, show_header=False, pad_edge=True, padding=(0, 1))
@@ -148,7 +150,7 @@ def _transform_rows(result: Registration) -> list[tuple[str, str]]:
     rows = [("yaw", f"{math.degrees(yaw):+.3f} degrees, tilt {tilt:.3f}")]
     shift = shift_text(pair)
     if shift:
-        rows.append(("shift of the middle", shift))
+        rows.append(("shift of the centroid", shift))
     return [*rows, ("result in", result_text(pair))]
 
 

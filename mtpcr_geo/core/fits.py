@@ -10,6 +10,7 @@ import numpy as np
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import ComparesArrays, Floats, Mask
+from mtpcr_geo.core.equations import BlockEquations
 
 IcpMethod = Literal["gicp", "point_to_plane", "point_to_point"]
 
@@ -201,6 +202,7 @@ class Refinement(ComparesArrays):
         ground_before: height and tilt settled before ICP, where that was asked for.
         icp: what ICP came to, where it ran.
         ground_after: height settled after ICP, where that was asked for.
+        equations: of the last round of ICP, in blocks; None where none was followed.
 
     """
 
@@ -209,6 +211,7 @@ class Refinement(ComparesArrays):
     ground_before: GroundFit | None = None
     icp: IcpResult | None = None
     ground_after: GroundFit | None = None
+    equations: BlockEquations | None = None
 
     def audit(self) -> dict[str, Any]:
         """Return what each step did, for the audit."""

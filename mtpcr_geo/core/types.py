@@ -23,6 +23,7 @@ from mtpcr_geo.core.fits import Solution as Solution
 from mtpcr_geo.core.fits import SolveSettings as SolveSettings
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.prior import KnownPlace as KnownPlace
+from mtpcr_geo.core.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.frames import FrameLink, WorkFrame
@@ -291,6 +292,35 @@ class Rival:
 
 
 @dataclass(frozen=True)
+class Check:
+    """One check of a verdict.
+
+    Attributes:
+        name: what is checked, in a few words.
+        value: what was found.
+        wanted: what is wanted.
+        passed: whether it is met; None where it could not be checked, or only informs.
+        meaning: what the figure is, in a sentence.
+        decides: whether the verdict depends on it; else it warns.
+
+    """
+
+    name: str
+    value: str
+    wanted: str
+    passed: bool | None
+    meaning: str
+    decides: bool = True
+
+    @property
+    def status(self) -> str:
+        """Return "passed", "not passed", "warning" or "not checked"."""
+        if self.passed is None:
+            return "not checked"
+        return "passed" if self.passed else "not passed" if self.decides else "warning"
+
+
+@dataclass(frozen=True)
 class Verdict:
     """The judgement of a run.
 
@@ -300,6 +330,9 @@ class Verdict:
             not be checked.
         metrics: the numbers behind it, with units in their names.
         rivals: other poses that fit nearly as well, the strongest first.
+        sentence: verdict, probability and expected accuracy in one sentence.
+        checks: what was checked, each with what was wanted.
+        uncertainty: of the pose; None where too little agrees to tell.
 
     """
 
@@ -307,6 +340,14 @@ class Verdict:
     reasons: tuple[str, ...]
     metrics: dict[str, Any]
     rivals: tuple[Rival, ...] = ()
+    sentence: str = ""
+    checks: tuple[Check, ...] = ()
+    uncertainty: Uncertainty | None = None
+
+    @property
+    def headline(self) -> str:
+        """The sentence, or where nothing was judged the verdict and its first reason."""
+        return self.sentence or f"{self.name.capitalize()}: {'; '.join(self.reasons[:1]) or 'not judged'}."
 
     @property
     def withholds_transform(self) -> str | None:

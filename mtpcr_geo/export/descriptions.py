@@ -47,10 +47,22 @@ _LABELS = {
     "yaw_deg": "yaw, work frame",
     "tilt_deg": "tilt, work frame",
     "shift_work_m": "translation, work frame",
-    "tie_points_agreeing": "tie points that agree with the final transform",
+    "tie_points_agreeing": "tie points that agree with the final transform, in plan",
     "sigma_yaw_deg": "standard deviation of yaw",
-    "sigma_plan_m": "standard deviation in plan",
-    "sigma_plan_source_centroid_m": "standard deviation in plan, middle of the source",
+    "sigma_tilt_deg": "standard deviation of tilt",
+    "sigma_plan_m": "standard deviation in plan, middle of the overlap",
+    "sigma_height_m": "standard deviation in height, middle of the overlap",
+    "sigma_plan_far_m": "standard deviation in plan, farthest point of the source",
+    "sigma_height_far_m": "standard deviation in height, farthest point of the source",
+    "within_95_plan_m": "95 % of errors in plan, middle of the overlap",
+    "within_95_height_m": "95 % of errors in height, middle of the overlap",
+    "within_95_plan_far_m": "95 % of errors in plan, farthest point of the source",
+    "within_95_height_far_m": "95 % of errors in height, farthest point of the source",
+    "weakest_direction_deg": "direction in which the middle is least sure, from north to east",
+    "held_out_effective": "places that the held-out tie points stand for",
+    "held_out_effective_agreeing": "of these, places that agree",
+    "held_out_expected": "held-out tie points that chance would make agree",
+    "tie_points_height_off": "of these, off in height",
 }
 _UNITS = (("_m2", "m²"), ("_m", "m"), ("_deg", "°"), ("_s", "s"), ("_mb", "MB"), ("_cells", "cells"))
 _SHARES = ("_share", "overlap_source", "overlap_target", "_support")
@@ -142,7 +154,7 @@ def transform_rows(pair: Pair) -> list[Row]:
     rows = [("yaw", f"{math.degrees(yaw):+.4f}° (counter-clockwise from above)"), ("tilt", f"{tilt:.4f}°")]
     moved = shift_text(pair)
     if moved:
-        rows.append(("shift of the source's middle", moved))
+        rows.append(("shift of the source's centroid", moved))
     rows.append(("result in", result_text(pair)))
     chain = TransformChain.of(pair)
     shifts = {
@@ -160,18 +172,79 @@ def transform_rows(pair: Pair) -> list[Row]:
     if offset is not None:
         rows.append(("height offset found", f"{offset:+.3f} m, added to the source's heights"))
     if pair.tie_points is not None and len(pair.tie_points.target):
-        inlier = np.asarray(pair.tie_points.inlier, bool)
-        rows.append(("tie points", f"{len(inlier)}, of which {int(inlier.sum())} agree with the transform"))
-        if inlier.any():
-            off = surface_residuals(pair)[inlier]
-            plan, height = np.median(np.hypot(off[:, 0], off[:, 1])), np.median(np.abs(off[:, 2]))
-            rows.append(
-                ("residual of the agreeing ones", f"median {plan:.2f} m in plan, {height:.2f} m in height")
-            )
+        rows += _tie_point_rows(pair)
     icp = pair.refinement.icp if pair.refinement is not None else None
     if icp is not None:
         rows.append(("refined by", refinement_text(icp)))
     return rows
+
+
+def _tie_point_rows(pair: Pair) -> list[Row]:
+    """Return how many tie points agree with the transform, in plan, and their heights apart."""
+    assert pair.tie_points is not None
+    inlier = np.asarray(pair.tie_points.inlier, bool)
+    rows = [("tie points", f"{len(inlier)}, of which {int(inlier.sum())} agree with the transform in plan")]
+    if not inlier.any():
+        return rows
+    off = surface_residuals(pair)[inlier]
+    plan, height = np.median(np.hypot(off[:, 0], off[:, 1])), np.median(np.abs(off[:, 2]))
+    text = f"median {plan:.2f} m in plan, {height:.2f} m in height"
+    metrics = pair.verdict.metrics if pair.verdict is not None else {}
+    beyond = metrics.get("tie_points_height_off")
+    if beyond:
+        most = metrics["tie_points_height_tolerance_m"]
+        text += (
+            f"; {beyond} of them are off by more than {most:.2f} m in height, in which they are not matched: "
+            "crowns, eaves"
+        )
+    return [*rows, ("residual of the agreeing ones", text)]
+
+
+def check_rows(verdict: Verdict) -> list[tuple[str, str, str, str]]:
+    """Return the checks as (check, value, wanted, status)."""
+    return [(one.name, one.value, one.wanted, one.status) for one in verdict.checks]
+
+
+def uncertainty_rows(verdict: Verdict) -> list[Row]:
+    """Return the expected error of the pose, one standard deviation each, and where it is taken about."""
+    if verdict.uncertainty is None:
+        return []
+    known = verdict.uncertainty.metrics
+    return [
+        (
+            "standard deviation in the middle of the overlap",
+            f"{_short(known['sigma_plan_m'])} m in plan, {_short(known['sigma_height_m'])} m in height",
+        ),
+        (
+            "at the farthest point of the source",
+            f"{_short(known['sigma_plan_far_m'])} m in plan, "
+            f"{_short(known['sigma_height_far_m'])} m in height",
+        ),
+        (
+            "of the rotation",
+            f"{_short(known['sigma_yaw_deg'])}° in yaw, {_short(known['sigma_tilt_deg'])}° in tilt",
+        ),
+    ]
+
+
+def registration_rows(pair: Pair | None, verdict: Verdict) -> list[Row]:
+    """Return clouds, transform, overlap and reasons of a verdict: what a registration prints of itself."""
+    rows = []
+    if pair is not None:
+        names = (Path(side.cloud.name).name for side in (pair.source, pair.target))
+        rows.append(("clouds", " to ".join(names)))
+        if pair.T_target_source is not None:
+            R = pair.T_target_source[:3, :3]
+            yaw = transforms.yaw_of(R)
+            tilt = math.degrees(transforms.rotation_angle(transforms.yaw_matrix(yaw).T @ R))
+            shift = shift_text(pair)
+            text = f"yaw {math.degrees(yaw):+.3f}°, tilt {tilt:.3f}°"
+            rows.append(("transform", f"{text}, the centroid moves by {shift}" if shift else text))
+    overlap = verdict.metrics.get("overlap_m2")
+    if overlap is not None:
+        shares = [f"{verdict.metrics[f'overlap_{role}']:.0%} of the {role}" for role in ("source", "target")]
+        rows.append(("overlap", f"{overlap:,.0f} m², {' and '.join(shares)}"))
+    return rows + [("reason", reason) for reason in verdict.reasons[:2]]
 
 
 def refinement_text(icp: IcpResult) -> str:
@@ -197,7 +270,7 @@ def units_text(link: FrameLink) -> str:
 
 
 def shift_text(pair: Pair) -> str:
-    """Return how far the source's middle moves: metres in the work frame, or in the clouds' local frame.
+    """Return how far the source's centroid moves: metres in the work frame, or in the clouds' local frame.
 
     Empty where source and target share no frame, so that no shift has a meaning.
     """
@@ -230,17 +303,15 @@ def _operation_rows(link: FrameLink) -> list[Row]:
 
 
 def worked_example(pair: Pair) -> tuple[Floats, Floats] | None:
-    """Return one point, the middle of the source, before and after: (3,) source and target file coordinates.
+    """Return one point, the source's centroid, before and after: (3,) source and target file coordinates.
 
     It is moved by the whole chain, not by the single 4x4, so it can serve to check that.
     """
     if pair.T_target_source is None:
         return None
-    source = pair.source
-    low, high = (source.cloud.minimum, source.cloud.maximum) if source.bounds is None else source.bounds
-    middle = (low + high) / 2
-    before: Floats = np.asarray(np.round(middle, 3), np.float64)
-    return before, TransformChain.of(pair).forward(before[np.newaxis])[0]
+    chain = TransformChain.of(pair)
+    before: Floats = np.asarray(np.round(chain.pivot, 3), np.float64)
+    return before, chain.forward(before[np.newaxis])[0]
 
 
 def surface_residuals(pair: Pair) -> Floats:
@@ -250,7 +321,10 @@ def surface_residuals(pair: Pair) -> Floats:
 
 
 def hypothesis_rows(pair: Pair) -> list[tuple[str, ...]]:
-    """Return the candidate poses as texts (rank, yaw, shift, score, overlap), best first."""
+    """Return the candidate poses as texts (rank, yaw, shift, strength, overlap), as the matcher ranks them.
+
+    The strength is what margins are taken of; the score where a matcher has none.
+    """
     if pair.matches is None:
         return []
     cell = pair.target.bev.grid.cell if pair.target.bev is not None else math.nan
@@ -259,7 +333,7 @@ def hypothesis_rows(pair: Pair) -> list[tuple[str, ...]]:
             str(rank),
             f"{_half_turn(math.degrees(one.yaw)):+.1f}°",
             f"{one.shift[0]:+.1f}, {one.shift[1]:+.1f} m",
-            f"{one.score:.4g}",
+            f"{one.score if one.strength is None else one.strength:.4g}",
             f"{one.overlap_cells * cell * cell:,.0f} m²" if one.overlap_cells else "",
         )
         for rank, one in enumerate(pair.matches.hypotheses, start=1)

@@ -3,8 +3,29 @@
 Units are those in which a key ends; what is not known is null. ``<...>`` stands
 for a name: a stage's tag, a role (source, target, result, work), a library.
 
+- ``sentence``: verdict, probability and expected accuracy in one sentence, with which terminal, report and
+  recording begin
 - ``verdict``: accepted, doubtful or refused; null where the run ended before a verdict
 - ``reasons``: why: one sentence each
+- ``probability``: of being within 5 degrees and 2 m of the truth, as in the metrics; null from keypoints, or
+  where nothing was judged
+- ``checks[].check``: what was checked, those that decide first; empty where nothing was judged
+- ``checks[].value``: what was found
+- ``checks[].wanted``: what is wanted
+- ``checks[].status``: passed, not passed, warning (not met, and the verdict does not depend on it), or not
+  checked
+- ``checks[].meaning``: what the figure is
+- ``uncertainty``: of the pose; null where too little agrees to tell
+- ``uncertainty.covariance``: 6x6, of the error of the pose as a correction about the pivot
+- ``uncertainty.order``: of its rows
+- ``uncertainty.axes``: 3x3, takes work axes to those of the covariance: x, y and up of the levelled target
+- ``uncertainty.pivot_work``: the pivot, middle of what was fitted, in the target's work coordinates
+- ``uncertainty.pivot``: the same in the coordinates of the result
+- ``uncertainty.farthest``: the registered source's point farthest from the pivot, in the coordinates of the
+  result
+- ``uncertainty.from``: what it was taken from
+- ``uncertainty.blocks``: blocks of the overlap, left out one at a time
+- ``uncertainty.correspondences``: corresponding points in them
 - ``rivals``: other poses that fit nearly as well, with a margin below the limit, strongest first; empty where
   there are none, and where the verdict is accepted
 - ``rivals[].east_m``: where one puts the middle of the tie points, from where the pose found does
@@ -80,7 +101,7 @@ The metrics:
 - ``metrics.probability``: probability of being within 5 degrees and 2 m of the truth, from a model fitted to
   runs of known answer; null from keypoints
 - ``metrics.refinement_lost``: whether surfaces fit better where the tie points do not agree
-- ``metrics.refined_away_m``: how far the refinement moved the middle of the source
+- ``metrics.refined_away_m``: how far the refinement moved the middle of the tie points, in plan
 - ``metrics.vertical_offset_m``: metres added to the source's heights, with vertical: estimate
 - ``metrics.yaw_deg``: yaw of the transform in the work frame, counter-clockwise from above
 - ``metrics.tilt_deg``: angle by which it tilts the vertical
@@ -88,10 +109,45 @@ The metrics:
 - ``metrics.prior_distance_m``: how far the middle of the source lies from where --near or --prior puts it
 - ``metrics.prior_yaw_difference_deg``: how far the yaw is from that of --yaw or --prior
 - ``metrics.tie_points``: all tie points
-- ``metrics.tie_points_agreeing``: of these, tie points that agree with the final transform
-- ``metrics.sigma_yaw_deg``: standard deviation of the yaw, from the tie points
-- ``metrics.sigma_plan_m``: standard deviation of the shift in plan, from the tie points
-- ``metrics.sigma_plan_source_centroid_m``: the same at the middle of the source
+- ``metrics.tie_points_agreeing``: of these, tie points that agree with the final transform in plan, within
+  the tolerance; the same as are drawn as agreeing
+- ``metrics.tie_points_height_off``: of these, tie points whose heights are off by more than
+  ``tie_points_height_tolerance_m``: they are matched in plan, and stand on a crown in one cloud and beside it
+  in the other
+- ``metrics.tie_points_height_tolerance_m``: three robust standard deviations of the agreeing ones' heights, a
+  cell at least
+- ``metrics.tie_points_plan_median_m``: median distance in plan of those that agree
+- ``metrics.tie_points_height_median_m``: median of the absolute height differences of those that agree
+- ``metrics.held_out_effective``: places that the held-out tie points stand for, overlapping patches once
+- ``metrics.held_out_effective_agreeing``: of these, places that agree
+- ``metrics.held_out_expected``: held-out tie points that chance would make agree; null from keypoints
+- ``metrics.solid_cells``: cells inside roofs of one cloud that the other fills
+- ``metrics.free_space_conflicts``: of these, cells in which the other sees the ground
+- ``metrics.sigma_plan_m``: standard deviation of the middle of the overlap in plan, along its weakest
+  direction; this and what follows are null or missing where too little agrees to tell
+- ``metrics.sigma_height_m``: standard deviation of its height
+- ``metrics.sigma_yaw_deg``: standard deviation of the yaw
+- ``metrics.sigma_tilt_deg``: standard deviation of the tilt about its weakest axis
+- ``metrics.sigma_plan_far_m``: as in the middle, at the source's point that lies farthest from there
+- ``metrics.sigma_height_far_m``: likewise
+- ``metrics.within_95_plan_m``: what 95 % of the errors in plan are below, in the middle of the overlap
+- ``metrics.within_95_height_m``: the same of the height
+- ``metrics.within_95_plan_far_m``: as in the middle, at the farthest point of the source
+- ``metrics.within_95_height_far_m``: likewise
+- ``metrics.weakest_direction_deg``: direction in plan in which the middle is least sure, from y (north) to x
+  (east), 0 to 180
+- ``metrics.uncertainty_blocks``: blocks of the overlap, left out one at a time
+- ``metrics.quarters_apart_plan_m``: standard deviation of where the quarters of the overlap, each solved by
+  itself, put their middles, in plan
+- ``metrics.quarters_apart_height_m``: the same in height
+- ``metrics.weakest_motion_m``: standard deviation of the motion in plan, shift or turn, that the fit tells
+  least
+- ``metrics.weakest_motion_turning``: share of it that is a turn about the middle, 0 to 1
+- ``metrics.drift_plan_m``: by how much what is left after the fit bends along the overlap, in plan; null with
+  few blocks
+- ``metrics.drift_height_m``: the same in height
+- ``metrics.drift_length_m``: length of the overlap along that axis
+- ``metrics.drift_clearness``: the bend over its own standard error
 
 A stage's own figures (``stages[].metadata``), by its type; stages that PDAL serves have what PDAL reports:
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -18,6 +19,7 @@ from mtpcr_geo.core.scanner import Scanner
 from mtpcr_geo.core.units import Axes, Unit
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.crs.facts import facts_of
+from mtpcr_geo.export.uncertainty_facts import calibrated, uncertainty_facts
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -54,6 +56,7 @@ def write_transform_json(path: str | Path, pair: Pair, *, forced: bool = False) 
         "T_target_source": T,
         "T_source_target": np.linalg.inv(T) if not _is_rigid(T) else transforms.inverse(T),
         "verdict": _verdict(pair, forced),
+        "uncertainty": uncertainty_facts(pair),
         "frame": "coordinates as they stand in the files: T takes those of the source to the target's",
         "exactness": {
             "exact": chain.is_affine,
@@ -212,8 +215,15 @@ def dumps(value: Any, indent: int = 0) -> str:
 def _verdict(pair: Pair, forced: bool) -> dict[str, Any] | None:
     if pair.verdict is None:
         return None
+    names = ("sigma_plan_m", "sigma_height_m", "sigma_yaw_deg", "sigma_tilt_deg", "sigma_plan_far_m",
+             "sigma_height_far_m")  # fmt: skip
     return {
         "name": pair.verdict.name,
+        "sentence": pair.verdict.headline,
+        "probability": pair.verdict.metrics.get("probability"),
+        "sigmas": {name: pair.verdict.metrics.get(name) for name in names},
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "calibrated": calibrated(pair.verdict),
         "reasons": list(pair.verdict.reasons),
         "rivals": [asdict(rival) for rival in pair.verdict.rivals],
         "forced": forced,

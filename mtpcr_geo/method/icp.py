@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.arrays import Floats, Indices
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import IcpMethod, IcpRound
@@ -66,6 +66,24 @@ class Descent:
 
     T: Floats
     rounds: tuple[IcpRound, ...]
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """Points of the source under a transform, and what they meet.
+
+    Attributes:
+        index: (n,) of the points among those kept of the source.
+        places: (n, 3) where the transform puts them, less the pivot, metres.
+        gap: (n, 3) from there to the nearest point of the target, metres.
+        weight: (n, 3, 3) information of the gap as GICP weighs it.
+
+    """
+
+    index: Indices
+    places: Floats
+    gap: Floats
+    weight: Floats
 
 
 class Surfaces:
@@ -195,6 +213,32 @@ class Surfaces:
         nearest = np.asarray(self._tree.batch_knn_search(moved, 1, self._threads)[0])[:, 0].astype(np.int64)
         gap = np.einsum("ij,ij->i", normal, self._t[nearest] - moved)
         return float((gap**2 / (gap**2 + MEETS_M**2)).mean())
+
+    @property
+    def pivot(self) -> Floats:
+        """Origin near the middle of the overlap, (3,) target work coordinates, metres."""
+        return np.asarray(self._pivot)
+
+    def correspondences(self, T: Floats, within_m: float, among: Indices) -> Correspondences:
+        """Return what GICP sees at a transform: points, gaps and weights.
+
+        Args:
+            T: 4x4 from source to target, work coordinates.
+            within_m: farthest correspondence, metres.
+            among: (k,) points of the source to look at, see `sizes`.
+
+        """
+        chosen = np.asarray(among)
+        X = self._relative(T)
+        moved = transforms.apply(X, self._s[chosen])
+        nearest, squared = self._tree.batch_knn_search(moved, 1, self._threads)
+        near_by = np.asarray(squared)[:, 0] <= within_m**2
+        chosen, moved = chosen[near_by], moved[near_by]
+        partner = np.asarray(nearest)[near_by, 0].astype(np.int64)
+        R = X[:3, :3]
+        spread = np.asarray(self._source.covs())[chosen, :3, :3]
+        spread = R @ spread @ R.T + np.asarray(self._target.covs())[partner, :3, :3]
+        return Correspondences(chosen, moved, self._t[partner] - moved, np.linalg.inv(spread))
 
     def _with_surfaces(self, cloud: Any) -> Any:
         """Find a cloud's normals and covariances, which are stored in it, and give its tree."""

@@ -110,8 +110,12 @@ class Overlap:
 
     @property
     def area_m2(self) -> float:
-        """Area of the cells of the source that the target covers too, square metres."""
-        return float((self.shared & (self.source.count > 0)).sum()) * self.grid.cell**2
+        """Area that both clouds cover, square metres; the same whichever is the source.
+
+        It is the mean of the areas of either cloud's filled cells in the shared part: a sparse one fills few.
+        """
+        filled = [float((self.shared & (bev.count > 0)).sum()) for bev in (self.source, self.target)]
+        return (filled[0] + filled[1]) / 2.0 * self.grid.cell**2
 
     def share_of(self, bev: Bev) -> float:
         """Share of one raster's filled cells that lie in the overlap."""

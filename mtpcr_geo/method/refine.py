@@ -12,6 +12,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.types import GroundFit, IcpMethod, IcpResult, IcpRound, IcpTrial, Refinement
 from mtpcr_geo.method.icp import Descent, Rounds, Surfaces, rounds_for
+from mtpcr_geo.method.jackknife import equations_of_surfaces
 from mtpcr_geo.method.overlap import OVERLAP_CELL_M, Overlap, overlap_of
 from mtpcr_geo.method.scales import ground_cell_for
 
@@ -138,7 +139,8 @@ def inverse_of(refinement: Refinement) -> Refinement:
             T_surfaces=None if icp.T_surfaces is None else transforms.inverse(icp.T_surfaces),
         )
     before = transforms.inverse(refinement.T_before)
-    return Refinement(transforms.inverse(refinement.T), before, ground[0], icp, ground[1])
+    equations = None if refinement.equations is None else refinement.equations.inverse()
+    return Refinement(transforms.inverse(refinement.T), before, ground[0], icp, ground[1], equations)
 
 
 def _refine(
@@ -192,7 +194,11 @@ def _refine(
         )
         ground_after = replace(ground_after, followed=followed)
         T = ground_after.T if followed else T
-    return Refinement(T, T_start, ground_before, icp, ground_after)
+    equations = None
+    if surfaces is not None and icp is not None and icp.followed:
+        last = icp.fine or icp.rounds[-1]
+        equations = equations_of_surfaces(surfaces, T, last.max_correspondence_distance_m)
+    return Refinement(T, T_start, ground_before, icp, ground_after, equations)
 
 
 @dataclass(frozen=True)

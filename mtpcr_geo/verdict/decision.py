@@ -12,10 +12,12 @@ from typing import Any
 
 from mtpcr_geo.core.types import Verdict, VerdictName
 from mtpcr_geo.core.wording import only
+from mtpcr_geo.verdict.checks import checks_of, warnings_of
 from mtpcr_geo.verdict.findings import (
     FEWEST_GROUND_CELLS,
+    CheckFinding,
     against_others,
-    agreement,
+    agreement_beyond_chance,
     chance_text,
     few_finding,
     ground_checked,
@@ -31,6 +33,7 @@ from mtpcr_geo.verdict.findings import (
 )
 from mtpcr_geo.verdict.limits import Evidence, Limits
 from mtpcr_geo.verdict.probability import probability_of
+from mtpcr_geo.verdict.sentence import sentence_of
 
 __all__ = ["Evidence", "Limits", "assess"]
 
@@ -52,26 +55,36 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
     else:
         judged = probability_finding(evidence, limits, probability)
         weak = False  # the probability weighs the evidence together already
-    findings = [
-        few_finding(evidence),
-        judged,
-        margin_finding(evidence, limits),
-        null_finding(evidence, limits),
-        *refinement_findings(evidence, limits),
-        ground_finding(evidence, limits),
-        ground_shape_finding(evidence, limits),
-        overlap_finding(evidence, limits),
-    ]
-    refusals = [found.text for found in findings if found is not None and found.refuses]
-    doubts = [found.text for found in findings if found is not None and not found.refuses]
+    judgements: dict[str, list[CheckFinding | None]] = {
+        "probability": [judged],
+        "tie points": [few_finding(evidence)],
+        "next distinct pose": [margin_finding(evidence, limits)],
+        "mirrored source": [null_finding(evidence, limits)],
+        "refinement": [*refinement_findings(evidence, limits)],
+        "ground heights": [ground_finding(evidence, limits)],
+        "ground shape": [ground_shape_finding(evidence, limits)],
+        "shared ground": [overlap_finding(evidence, limits)],
+    }
+    judged_so = {name: [found for found in some if found is not None] for name, some in judgements.items()}
+    findings = [found for some in judged_so.values() for found in some]
+    refusals = [found.text for found in findings if found.refuses]
+    doubts = [found.text for found in findings if not found.refuses]
     doubts += evidence.contradictions
     if len(doubts) >= 2 and weak and not refusals:
         refusals = [f"{len(doubts)} checks are not met, and the rest of the evidence does not make up for it"]
     name: VerdictName = "refused" if refusals else "doubtful" if doubts else "accepted"
     reasons = [*refusals, *doubts] if name != "accepted" else _grounds(evidence, probability)
     rivals = tuple(rival for rival in evidence.rivals if rival.margin < limits.margin)
-    notes = not_checked(evidence, name)
-    return Verdict(name, (*reasons, *notes), metrics | (more or {}), () if name == "accepted" else rivals)
+    notes = not_checked(evidence, name) + warnings_of(evidence)
+    return Verdict(
+        name,
+        (*reasons, *notes),
+        metrics | (more or {}),
+        () if name == "accepted" else rivals,
+        sentence=sentence_of(name, probability, evidence.uncertainty, reasons, mapped=evidence.mapped),
+        checks=checks_of(evidence, limits, probability, {key for key, some in judged_so.items() if some}),
+        uncertainty=evidence.uncertainty,
+    )
 
 
 def metrics_of(evidence: Evidence) -> dict[str, Any]:
@@ -102,7 +115,7 @@ def metrics_of(evidence: Evidence) -> dict[str, Any]:
 def _grounds(evidence: Evidence, probability: float | None) -> list[str]:
     """Return what an acceptance rests on."""
     grounds = [] if probability is None else [f"the pose is right with {chance_text(probability)}"]
-    grounds.append(agreement(evidence))
+    grounds.append(agreement_beyond_chance(evidence))
     grounds += against_others(evidence)
     return [
         *grounds,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.statistics import chance_within
 from mtpcr_geo.core.types import Hypothesis, Pair, Rival, SolveSettings, TiePoints
@@ -17,8 +17,8 @@ from mtpcr_geo.method.overlap import overlap_of
 from mtpcr_geo.method.scales import MAX_LEAST_OVERLAP_M2, ground_cell_for, scales_of, tolerance_for
 from mtpcr_geo.method.shortcomings import what_is_missing
 from mtpcr_geo.method.solve import solve_tie_points
+from mtpcr_geo.verdict.further import with_further
 from mtpcr_geo.verdict.limits import Evidence
-from mtpcr_geo.verdict.probability import TIE_POINTS_PER_PATCH
 
 GROUND_AGREES_M = 0.5
 UNBOUNDED_CELLS = 2.0
@@ -87,6 +87,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
             if side.levelling.method == "none" and not side.levelling.trusted
         ),
     )
+    evidence, further = with_further(evidence, pair, overlap, ground, tie_points, agreeing)
     shift = T[:3, 3]
     offset = TransformChain.of(pair).vertical_offset_m
     more = {
@@ -96,14 +97,27 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         "shift_work_m": [float(v) for v in shift],
         "tie_points": len(tie_points.score),
         "tie_points_agreeing": int((residual < tolerance).sum()),
-        **_uncertainty(
-            tie_points,
-            residual,
-            tolerance,
-            transforms.apply(T_level, pair.source.levelled_sample.mean(axis=0)[None])[0],
-        ),
+        **_agreeing_heights(pair, residual < tolerance),
+        "held_out_expected": None if evidence.chance is None else evidence.chance * evidence.held_out,
+        **further,
     }
     return evidence, more
+
+
+def _agreeing_heights(pair: Pair, agreeing: Mask) -> dict[str, Any]:
+    """Return how the tie points that agree in plan compare in height, which they are not matched by."""
+    names = (
+        "tie_points_plan_median_m", "tie_points_height_median_m", "tie_points_height_off",
+        "tie_points_height_tolerance_m",
+    )  # fmt: skip
+    if pair.tie_points is None or pair.T_target_source is None or not agreeing.any():
+        return dict.fromkeys(names)
+    T = pair.levelled(pair.T_target_source)
+    gap = (transforms.apply(T, pair.tie_points.source) - pair.tie_points.target)[agreeing]
+    rise = np.abs(gap[:, 2] - np.median(gap[:, 2]))
+    most = max(3.0 * 1.4826 * float(np.median(rise)), tolerance_for(pair.cell))
+    plan, height = np.median(np.hypot(gap[:, 0], gap[:, 1])), np.median(np.abs(gap[:, 2]))
+    return dict(zip(names, (float(plan), float(height), int((rise > most).sum()), most), strict=True))
 
 
 def rivals_of(pair: Pair, tolerance: float) -> tuple[Rival, ...]:
@@ -166,11 +180,16 @@ def agreement(pair: Pair, T: Floats, tolerance: float | None = None) -> tuple[in
 
 def tie_points_agreeing(pair: Pair, T: Floats, tolerance: float | None = None) -> int:
     """Count the tie points that a transform brings together in plan; arguments as for `agreement`."""
+    return int(tie_point_agrees(pair, T, tolerance).sum())
+
+
+def tie_point_agrees(pair: Pair, T: Floats, tolerance: float | None = None) -> Mask:
+    """Return which tie points (n,) a transform brings together in plan; arguments as for `agreement`."""
     if pair.tie_points is None:
-        return 0
+        return np.zeros(0, bool)
     T_level = pair.levelled(T)
     gap = transforms.apply(T_level, pair.tie_points.source) - pair.tie_points.target
-    return int((np.hypot(gap[:, 0], gap[:, 1]) < (tolerance or tolerance_for(pair.cell))).sum())
+    return np.asarray(np.hypot(gap[:, 0], gap[:, 1]) < (tolerance or tolerance_for(pair.cell)))
 
 
 def cross_validated(tie_points: TiePoints, tolerance: float, settings: SolveSettings) -> Floats:
@@ -212,34 +231,3 @@ def _refined_away(pair: Pair, T: Floats) -> float:
     )
     moved = transforms.apply(T, middle)[0] - transforms.apply(before, middle)[0]
     return float(np.hypot(*(pair.target.T_level_work[:3, :3] @ moved)[:2]))
-
-
-def _uncertainty(
-    tie_points: TiePoints, residual: Floats, tolerance: float, centroid: Floats
-) -> dict[str, Any]:
-    """One standard deviation of yaw and plan position, from the scatter and spread of the tie points.
-
-    Args:
-        tie_points: all tie points.
-        residual: (n,) their plan residuals, metres.
-        tolerance: within which a tie point agrees, metres.
-        centroid: (3,) where the source's centroid comes to lie, in the target's levelled frame.
-
-    """
-    near = residual < 2.5 * tolerance
-    if near.sum() < 6:
-        return {"sigma_yaw_deg": None, "sigma_plan_m": None, "sigma_plan_source_centroid_m": None}
-    xy = tie_points.target[near, :2]
-    # a Rayleigh median is 1.1774 standard deviations of one coordinate
-    scatter = float(np.median(residual[near])) / 1.1774
-    independent = max(float(near.sum()) / TIE_POINTS_PER_PATCH, 1.5)
-    middle = xy.mean(axis=0)
-    arm = max(float(np.sqrt(((xy - middle) ** 2).sum(axis=1).mean())), 1.0)
-    plan = scatter / np.sqrt(independent)
-    yaw = plan / arm
-    lever = float(np.linalg.norm(centroid[:2] - middle))
-    return {
-        "sigma_yaw_deg": float(np.degrees(yaw)),
-        "sigma_plan_m": float(plan),
-        "sigma_plan_source_centroid_m": float(np.hypot(plan, yaw * lever)),
-    }

@@ -149,7 +149,7 @@ def margin_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
     if margin is None or margin >= limits.margin:
         return None
     near = [rival for rival in evidence.rivals if rival.margin < limits.margin]
-    others = "; ".join(_rival_text(rival, evidence.mapped) for rival in near[:MOST_NAMED])
+    others = "; ".join(rival_text(rival, evidence.mapped) for rival in near[:MOST_NAMED])
     others += "; ..." if len(near) > MOST_NAMED else ""
     what = f"another pose, {others}," if len(near) == 1 else "another pose"
     value, wanted = beside(margin, limits.margin, 2)
@@ -168,7 +168,7 @@ _AGAINST_RIVALS = (
 )
 
 
-def _rival_text(rival: Rival, mapped: bool) -> str:
+def rival_text(rival: Rival, mapped: bool) -> str:
     """Say where a rival lies from the pose found."""
     ways = (
         (("east", "west"), ("north", "south"))
@@ -279,6 +279,18 @@ def agreement(evidence: Evidence) -> str:
     return (
         f"{evidence.held_out_agreeing} of {evidence.held_out} held-out tie points agree "
         f"within {evidence.tolerance_m:g} m"
+    )
+
+
+def agreement_beyond_chance(evidence: Evidence) -> str:
+    """Say how many held-out tie points agree, beside what chance would give: what an acceptance rests on."""
+    agreed = (
+        f"{evidence.held_out_agreeing} held-out tie points agree in plan within {evidence.tolerance_m:g} m"
+    )
+    if evidence.chance is None:
+        return f"{agreed}, of {evidence.held_out}"
+    return (
+        f"{agreed}, where chance would make {evidence.chance * evidence.held_out:.0f} of {evidence.held_out}"
     )
 
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mtpcr_geo.core.types import Rival
+from mtpcr_geo.core.uncertainty import Uncertainty
+from mtpcr_geo.verdict.drift import Drift
+from mtpcr_geo.verdict.sliding import Sliding
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,13 @@ class Evidence:
         final_agreeing: of all tie points, those that agree with the final transform; None if not counted.
         refinement_lost: whether surfaces fit better where the tie points do not agree, and the tie points
             were followed.
+        uncertainty: of the pose; None where too little agrees to tell.
+        quarters_m: how far apart the quarters of the overlap, each solved by itself, put their middles in
+            plan, and what is wanted at most, metres; None where that is not known.
+        free_space: share of the cells of solids of one cloud in which the other sees the ground; None where
+            there are too few.
+        sliding: the motion in plan that the fit tells least; None where that is not known.
+        drift: how what is left bends along the overlap; None where that is not known.
         contradictions: what was known beforehand and is not so, a sentence each.
 
     """
@@ -65,6 +75,11 @@ class Evidence:
     rivals: tuple[Rival, ...] = ()
     mapped: bool = True
     not_levelled: tuple[str, ...] = ()
+    uncertainty: Uncertainty | None = None
+    quarters_m: tuple[float, float] | None = None
+    free_space: float | None = None
+    sliding: Sliding | None = None
+    drift: Drift | None = None
 
 
 @dataclass(frozen=True)

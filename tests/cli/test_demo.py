@@ -85,5 +85,5 @@ def test_demo_needs_no_extra(tmp_path):
 def test_verb_prints_verdict_and_errors(tmp_path):
     result = CliRunner().invoke(app, ["demo", "-o", str(tmp_path / "out")])
     assert result.exit_code == 0, result.output
-    assert "ACCEPTED" in result.stdout
+    assert "Accepted: " in result.stdout
     assert "Against the known truth: rotation 0.0" in result.stdout

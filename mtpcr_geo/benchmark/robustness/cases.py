@@ -20,12 +20,35 @@ from mtpcr_geo.benchmark.pairs import BenchmarkPair, load_pair, read_facts
 from mtpcr_geo.benchmark.robustness.places import dense_places, shared_places
 from mtpcr_geo.benchmark.worker import StartRange
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.arrays import Floats, Indices
+from mtpcr_geo.core.arrays import Floats, Indices, Mask
 from mtpcr_geo.core.errors import InputError
 
 PLACES = 3
+AIRBORNE_M = (0.09, 0.03)
+"""Root mean square per axis, in plan and height, of what the residual checks of seven airborne pairs see."""
 FEWEST_POINTS = 20
 """A disc with fewer points is no cloud that anybody would register."""
+
+
+@dataclass(frozen=True)
+class KnownTo:
+    """How well a truth is known: standard deviations.
+
+    Attributes:
+        plan_m, height_m: along each axis in plan, and in height, metres.
+        radius_m: of what the truth rests on, metres: its rotation is known as well as these over this.
+
+    """
+
+    plan_m: float = 0.0
+    height_m: float = 0.0
+    radius_m: float = 1.0
+
+    @property
+    def covariance(self) -> Floats:
+        """(6, 6) of rotations about x, y and up, radians, and shifts along them, metres."""
+        tilt, yaw = self.height_m / self.radius_m, self.plan_m / self.radius_m
+        return np.diag(np.array([tilt, tilt, yaw, self.plan_m, self.plan_m, self.height_m]) ** 2)
 
 
 @dataclass(frozen=True)
@@ -38,6 +61,7 @@ class CommonFrame:
         cell_m: edge of the cells in which overlap is measured, metres.
         target_crs: CRS of the target's frame but for `origin`; None for a local one.
         origin: (3,) whole metres, of this frame in the target's CRS.
+        known: how well it is known that the frames are one.
 
     """
 
@@ -46,6 +70,7 @@ class CommonFrame:
     cell_m: float = 1.0
     target_crs: str | None = None
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    known: KnownTo = KnownTo()
 
 
 class Recipe(Protocol):
@@ -136,6 +161,7 @@ class Case:
             options=options,
             drawn=drawn,
             middle=middle_of_overlap(made),
+            known=made.known,
             overlap=overlap_ratios(made.source, made.target, made.cell_m) if self.has_truth else None,
         )
 
@@ -158,6 +184,7 @@ class CaseClouds:
         middle: (3,) middle of the source's part in the overlap where it truly lies, in the frame in which
             both were made; of the whole source where nothing is shared.
         overlap: shares of the source's and the target's cells that are shared; None without a right answer.
+        known: how well the truth is known.
 
     """
 
@@ -169,13 +196,39 @@ class CaseClouds:
     drawn: dict[str, float]
     middle: Floats
     overlap: tuple[float, float] | None
+    known: KnownTo = KnownTo()
+
+
+@lru_cache(maxsize=32)
+def known_to(folder: Path) -> KnownTo:
+    """Return how well the truth of a real pair is known, as its ``pair.json`` says.
+
+    That is ``ground_truth.known_to_m``, or else the shift that its ``residual_check`` sees, which itself is
+    known only to a part of a cell: no airborne pair is taken for better than `AIRBORNE_M`.
+    """
+    facts = read_facts(folder)
+    pair = _pair(folder)
+    made = CommonFrame(pair.source, pair.target, pair.overlap_cell_m)
+    shared = made.source[_shared(made)]
+    radius = float(np.sqrt(shared[:, :2].var(axis=0).sum())) if len(shared) > 1 else 1.0
+    stated = facts["ground_truth"].get("known_to_m")
+    if stated is not None:
+        return KnownTo(float(stated), float(stated), radius)
+    seen = facts.get("residual_check", {})
+    plan = float(np.hypot(seen.get("dx_m", 0.0), seen.get("dy_m", 0.0)) / np.sqrt(2.0))
+    return KnownTo(max(plan, AIRBORNE_M[0]), AIRBORNE_M[1], radius)
 
 
 def middle_of_overlap(made: CommonFrame) -> Floats:
     """Return the mean (3,) of the source's points in cells that the target fills too; of all if in none."""
-    keys = [_cell_keys(xyz, made.cell_m) for xyz in (made.source, made.target)]
-    shared = np.isin(keys[0], np.unique(keys[1]))
+    shared = _shared(made)
     return np.asarray((made.source[shared] if shared.any() else made.source).mean(axis=0))
+
+
+def _shared(made: CommonFrame) -> Mask:
+    """Mark the source's points (n,) in cells that the target fills too."""
+    keys = [_cell_keys(xyz, made.cell_m) for xyz in (made.source, made.target)]
+    return np.asarray(np.isin(keys[0], np.unique(keys[1])))
 
 
 @dataclass(frozen=True)
@@ -194,7 +247,12 @@ class FolderClouds:
         pair = _pair(self.folder)
         origin = (float(pair.origin[0]), float(pair.origin[1]), float(pair.origin[2]))
         return CommonFrame(
-            pair.source, pair.target, pair.overlap_cell_m, target_crs_of(read_facts(self.folder)), origin
+            pair.source,
+            pair.target,
+            pair.overlap_cell_m,
+            target_crs_of(read_facts(self.folder)),
+            origin,
+            known_to(self.folder),
         )
 
 
@@ -220,7 +278,8 @@ class DiscClouds:
         pair = _pair(self.folder)
         rng = np.random.default_rng([self.seed, *self.folder.name.encode()])
         centre = shared_places(pair.source, pair.target, PLACES, rng)[self.place]
-        return CommonFrame(disc(pair.source, centre, self.radius), pair.target, pair.overlap_cell_m)
+        part = disc(pair.source, centre, self.radius)
+        return CommonFrame(part, pair.target, pair.overlap_cell_m, known=known_to(self.folder))
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from mtpcr_geo.benchmark.metrics import rotation_error_deg
+from mtpcr_geo.benchmark.robustness.coverage import covered
 from mtpcr_geo.benchmark.robustness.runner import COLUMNS, Row
 from mtpcr_geo.benchmark.tables import to_markdown
 from mtpcr_geo.core import transforms
@@ -219,7 +220,17 @@ def report(rows: Sequence[Row]) -> str:
         "unrelated have no right answer.\n",
         to_markdown(summarise(rows)),
     ]
-    for title, lines in (("Spread over starts", spreads(rows)), ("Both ways", swaps(rows))):
+    right = [row for row in rows if row["right"]]
+    coverage = [
+        {"suite": suite, **line}
+        for suite in dict.fromkeys(row["suite"] for row in right)
+        for line in covered([row for row in right if row["suite"] == suite])
+    ]
+    for title, lines in (
+        ("True errors within the region of 95 %, right runs", coverage),
+        ("Spread over starts", spreads(rows)),
+        ("Both ways", swaps(rows)),
+    ):
         if lines:
             text += [f"## {title}\n", to_markdown(lines)]
     wrong = [

@@ -11,6 +11,7 @@ import numpy as np
 
 from mtpcr_geo.benchmark.metrics import rotation_error_deg
 from mtpcr_geo.benchmark.robustness.cases import Case, CaseClouds
+from mtpcr_geo.benchmark.robustness.coverage import coverage_of
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import MtpcrError
@@ -37,6 +38,12 @@ ANSWER = (
     "verdict", "right", "precise", "rot_err_deg", "shift_err_m", "plan_err_m", "dz_err_m", "far_err_m",
     "swap_mm", "swap_deg", "swap_verdict", "time_s", "cpu_s", "peak_mib",
 )  # fmt: skip
+UNCERTAINTY = (
+    "sigma_plan_m", "sigma_height_m", "sigma_yaw_deg", "sigma_tilt_deg", "sigma_plan_far_m",
+    "sigma_height_far_m", "truth_m", "truth_height_m", "plan_of_95", "height_of_95", "yaw_of_95",
+    "tilt_of_95", "far_of_95",
+)  # fmt: skip
+"""Columns of the stated uncertainty, and of true errors over the half width of the region of 95 %."""
 FIGURES = (
     "neg_log10_p", "hypothesis_margin", "null_ratio", "patch_support", "strength", "overlap_m2",
     "ground_agreeing", "ground_cells", "held_out_tie_points", "held_out_agreeing",
@@ -46,7 +53,7 @@ MATCHER_FIGURES = (
     "extent_m", "margin", "mirrored_strengths", "neg_log10_p", "scores", "strengths", "support_next",
 )  # fmt: skip
 """Figures of the matcher's own report that `metrics` keeps."""
-COLUMNS = (*LABELS, *SCENE, *ANSWER, *FIGURES, "reason", "middle", "T_answer_true", "metrics")
+COLUMNS = (*LABELS, *SCENE, *ANSWER, *UNCERTAINTY, *FIGURES, "reason", "middle", "T_answer_true", "metrics")
 """Columns of a row, in order; see `run_case`."""
 
 
@@ -104,6 +111,8 @@ def run_clouds(clouds: CaseClouds, *, both_ways: bool = False) -> Row:
             in height (found minus true).
         far_err_m
             how far the worst point of the source is off, metres.
+        sigma_*, truth_*, *_of_95
+            see `mtpcr_geo.benchmark.robustness.coverage`.
         swap_mm, swap_deg, swap_verdict
             how far the transform with source and target exchanged is from the inverse, at the same middle;
             and its verdict.
@@ -133,6 +142,7 @@ def run_clouds(clouds: CaseClouds, *, both_ways: bool = False) -> Row:
     }
     if T is not None and np.isfinite(T).all():
         row |= errors_of(T, clouds)
+        row |= coverage_of(found, clouds)
         if both_ways:
             row |= _exchanged(T, clouds)
     return row

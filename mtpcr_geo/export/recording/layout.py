@@ -117,7 +117,9 @@ def _matches(recorded: Recorded) -> Any:
     if not recorded.has("hypotheses"):
         return rrb.Horizontal(matches, name="Matches")
     below = rrb.Horizontal(
-        rrb.BarChartView(origin="hypotheses/scores", name="Score of each candidate pose, best first"),
+        rrb.BarChartView(
+            origin="hypotheses/scores", name="Strength of each candidate pose"
+        ),
         rrb.TextDocumentView(origin="hypotheses/table", name="Candidate poses"),
     )
     return rrb.Vertical(matches, below, row_shares=[3, 1], name="Matches")

@@ -170,10 +170,12 @@ class RecordingWriter:
         assert pair.matches is not None
         if not pair.matches.hypotheses:
             return
-        scores = np.array([one.score for one in pair.matches.hypotheses], np.float64)
+        hypotheses = pair.matches.hypotheses
+        scores = np.array([one.score if one.strength is None else one.strength for one in hypotheses])
         ranks = np.arange(len(scores), dtype=np.float64) + 0.5  # a bar's left edge
         self._log("hypotheses/scores", rr.BarChart(scores, abscissa=ranks, color=drawing.UNJUDGED_RGB))
-        head = ("rank", "yaw", "shift", "score", "overlap")
+        strong = hypotheses[0].strength is not None
+        head = ("rank", "yaw", "shift", "strength" if strong else "score", "overlap")
         self._log(
             "hypotheses/table",
             self._markdown(descriptions.markdown_table(head, descriptions.hypothesis_rows(pair))),
@@ -319,9 +321,8 @@ class RecordingWriter:
         pair = self._pair
         parts = []
         if pair is not None and pair.verdict is not None:
-            parts.append(
-                f"# {pair.verdict.name.capitalize()}\n\n{descriptions.verdict_meaning(pair.verdict)}"
-            )
+            head, meaning = pair.verdict.headline, descriptions.verdict_meaning(pair.verdict)
+            parts.append(f"# {pair.verdict.name.capitalize()}\n\n{head}\n\n{meaning}")
             parts.append("\n".join(f"- {reason}" for reason in pair.verdict.reasons))
         else:
             parts.append("# Not judged yet")
@@ -329,11 +330,17 @@ class RecordingWriter:
             rows = descriptions.transform_rows(pair)
             if rows:
                 parts.append("## Transform\n\n" + descriptions.markdown_table(("what", "value"), rows))
+            if pair.verdict is not None and pair.verdict.checks:
+                table = descriptions.markdown_table(
+                    ("check", "value", "wanted", "met"), descriptions.check_rows(pair.verdict)
+                )
+                means = "\n".join(f"- {one.name}: {one.meaning}" for one in pair.verdict.checks)
+                parts.append(f"## Checks\n\n{table}\n\n{means}")
             if pair.verdict is not None and pair.verdict.metrics:
                 table = descriptions.markdown_table(
-                    ("check", "value"), descriptions.metric_rows(pair.verdict.metrics)
+                    ("figure", "value"), descriptions.metric_rows(pair.verdict.metrics)
                 )
-                parts.append("## Checks\n\n" + table)
+                parts.append("## All figures\n\n" + table)
             for side in [pair.target] if pair.source is pair.target else [pair.source, pair.target]:
                 if self._new(f"rows {side.role}", side):
                     self._side_texts[side.role] = descriptions.markdown_table(

@@ -8,14 +8,12 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.core.version import __version__
 from mtpcr_geo.crs import TransformChain
 from mtpcr_geo.export import charts, descriptions, drawing
-from mtpcr_geo.export.tie_points import footprints, tie_positions
+from mtpcr_geo.export.report import certainty
 
 _PICTURE_SIDE = 1000
 
@@ -45,7 +43,10 @@ svg{width:100%;height:auto;display:block}
 pre{background:var(--soft);padding:10px;overflow-x:auto;font-size:12.5px;line-height:1.45}
 ul{margin:6px 0;padding-left:20px}
 .key{display:inline-block;width:11px;height:11px;border-radius:2px;margin:0 4px 0 10px}
-.small{font-size:13px;color:#51606d}
+.small{font-size:13px;color:#51606d;white-space:normal}
+table.checks td:first-child{max-width:560px;color:var(--text)}
+.ok{color:#1a7a40}.warn{color:#a06c00;font-weight:600}.bad{color:#c0261c;font-weight:600}.none{color:#51606d}
+details{margin:10px 0}summary{cursor:pointer;color:#51606d}
 """
 
 
@@ -92,8 +93,9 @@ def _head(pair: Pair, names: str, written: Mapping[str, Any] | None) -> str:
         judged = '<div class="verdict none"><b>Not judged</b><p>The run ended before a verdict.</p></div>'
     else:
         reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
+        name, _, rest = verdict.headline.partition(":")
         judged = (
-            f'<div class="verdict {verdict.name}"><b>{verdict.name}</b>'
+            f'<div class="verdict {verdict.name}"><p><b>{escape(name)}:</b>{escape(rest)}</p>'
             f"<p>{escape(descriptions.verdict_meaning(verdict))}</p><ul>{reasons}</ul>{_left(written)}</div>"
         )
     return f'<h1>{escape(names)}</h1><div class="small">registered with mtpcr_geo {__version__}</div>{judged}'
@@ -155,55 +157,21 @@ def _pictures(pair: Pair) -> str:
             "roofs, kerbs and banks must continue across the borders."
         )
         figures.append(_figure(drawing.checkerboard(source, target), board))
+    figures += certainty.rivals_figures(pair, _figure, _key)
     if not figures:
         return "<p>No raster was made.</p>"
     return f'<div class="grid">{"".join(figures)}</div>'
 
 
 def _checks(pair: Pair) -> str:
-    parts = []
-    checks = ""
-    if pair.verdict is not None and pair.verdict.metrics:
-        checks = f"<div><h3>Checks</h3>{_table(descriptions.metric_rows(pair.verdict.metrics))}</div>"
-    if pair.matches is not None and pair.matches.hypotheses:
-        best = pair.matches.hypotheses[:10]
-        rows = descriptions.hypothesis_rows(pair)[: len(best)]
-        chart = charts.bars(
-            [one.score for one in best],
-            [f"{row[0]}.  yaw {row[1]}" for row in rows],
-            [row[3] for row in rows],
-        )
-        parts.append(
-            f"<figure><h3>Candidate poses</h3>{chart}<figcaption>Score of each pose that the search "
-            "proposed. The first was followed; the more it exceeds the others, the more certain it is."
-            "</figcaption></figure>"
-        )
+    checks = certainty.checks_table(pair)
+    parts = [certainty.error_map(pair, _figure), certainty.candidates_chart(pair)]
     if pair.tie_points is not None and pair.T_target_source is not None and len(pair.tie_points.target):
-        parts += _tie_charts(pair)
+        parts += certainty.tie_charts(pair, _key)
+    parts = [part for part in parts if part]
     if not parts and not checks:
         return "<p>There is nothing to judge the result by.</p>"
-    return f'<div class="grid">{checks}<div class="stack">{"".join(parts)}</div></div>'
-
-
-def _tie_charts(pair: Pair) -> list[str]:
-    target, registered = tie_positions(pair)
-    assert registered is not None
-    assert pair.tie_points is not None
-    residual = np.linalg.norm(registered - target, axis=1)
-    inlier = np.asarray(pair.tie_points.inlier, bool)
-    good, bad = drawing.residual_limits(residual, inlier)
-    limit = max(2.0 * bad, float(np.percentile(residual, 60)) * 1.2, 0.05)
-    colours = drawing.residual_colours(residual, good, bad)
-    plan = charts.residual_map(target, registered, colours, footprints(pair))
-    return [
-        f"<figure><h3>Residuals of the tie points</h3>{charts.histogram(residual, inlier, limit)}<figcaption>"
-        "Distance between both ends of each tie point after the transform."
-        f"{_key(drawing.GOOD_RGB, 'agrees')}{_key(drawing.BAD_RGB, 'does not')}</figcaption></figure>",
-        f"<figure><h3>Tie points in plan</h3>{plan}"
-        f"<figcaption>Tie points in plan, green below {good:g} m of residual, red from {bad:g} m; lines show "
-        "its direction. Lines that all point one way, or around one place, would mean that the transform is "
-        f"off.{_key(drawing.SOURCE_RGB, 'source')}{_key(drawing.TARGET_RGB, 'target')}</figcaption></figure>",
-    ]
+    return f'<div class="wide">{checks}</div><div class="grid">{"".join(parts)}</div>'
 
 
 def _transform(pair: Pair) -> str:

@@ -282,14 +282,19 @@ def run_facts(pair: Pair | None, context: RunContext) -> dict[str, Any]:
     if verdict is None and context.failure is not None:
         verdict = Verdict("refused", (context.failure,), {})
     from mtpcr_geo.export.transform import frames_of
+    from mtpcr_geo.export.uncertainty_facts import check_facts, uncertainty_facts
 
     facts = context.facts.audit()
     written = Written.of(context.done, context.outputs.written()).audit()
     seconds = {record.tag: round(record.seconds, 4) for record in context.done}
     return {
+        "sentence": verdict.headline if verdict else "The run ended before a verdict.",
         "verdict": verdict.name if verdict else None,
+        "probability": verdict.metrics.get("probability") if verdict else None,
         "reasons": list(verdict.reasons) if verdict else [],
         "rivals": [asdict(rival) for rival in verdict.rivals] if verdict else [],
+        "checks": check_facts(verdict),
+        "uncertainty": uncertainty_facts(pair) if pair is not None else None,
         "metrics": verdict.metrics if verdict else {},
         # whether to use it is the verdict's to say
         "T_target_source": TransformChain.of(pair).T_file

@@ -279,7 +279,7 @@ class Assess(Stage):
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Gather the evidence and judge."""
         from mtpcr_geo.verdict.decision import Limits, assess
-        from mtpcr_geo.verdict.evidence import gather
+        from mtpcr_geo.verdict.evidence import gather, tie_point_agrees
         from mtpcr_geo.verdict.prior import departure
 
         pair = self.one_pair(inputs)
@@ -300,7 +300,11 @@ class Assess(Stage):
         )
         verdict = assess(evidence, limits, more)
         self.metadata |= {"verdict": verdict.name, "reasons": list(verdict.reasons), **verdict.metrics}
-        return pair.with_(verdict=verdict)
+        # from here on "agrees" means one thing everywhere: with the final transform, within the tolerance
+        assert pair.T_target_source is not None
+        assert pair.tie_points is not None
+        agreeing = tie_point_agrees(pair, pair.T_target_source, evidence.tolerance_m)
+        return pair.with_(verdict=verdict, tie_points=replace(pair.tie_points, inlier=agreeing))
 
     def _no_worse_than_prior(self, pair: Pair) -> Pair:
         """Keep the transform known beforehand where tie points, ground and surfaces agree with it as well."""
