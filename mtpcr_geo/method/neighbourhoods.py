@@ -31,3 +31,12 @@ def local_shapes(
     neighbourhood = neighbourhood - neighbourhood.mean(axis=1, keepdims=True)
     values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", neighbourhood, neighbourhood))
     return np.sqrt(np.maximum(values, 0.0)), axes
+
+
+def spacings(xy: Floats) -> Floats:
+    """Return the distance of each of (n, 2) points to its nearest neighbour, (n,), n at least 2."""
+    import small_gicp
+
+    flat = np.column_stack([xy, np.zeros(len(xy))])
+    tree = small_gicp.KdTree(flat, 1)
+    return np.sqrt(np.asarray(tree.batch_knn_search(flat, 2, 1)[1])[:, 1])

@@ -6,10 +6,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.types import Pair, TiePoints
+from mtpcr_geo.method.neighbourhoods import spacings
 from mtpcr_geo.method.overlap import CommonGround, Overlap
 from mtpcr_geo.verdict.drift import drift_of
 from mtpcr_geo.verdict.free_space import free_space_of
@@ -97,7 +97,7 @@ def effective_number(xy: Floats, agreeing: Mask) -> tuple[int, int]:
     """
     if len(xy) < 2:
         return len(xy), int(agreeing.sum())
-    nearest = cKDTree(xy).query(xy, 2)[0][:, 1]
+    nearest = spacings(xy)
     edge = max(PATCH_SPACINGS * float(np.median(nearest)), 1e-6)
     _, number = np.unique(np.floor(xy / edge).astype(np.int64), axis=0, return_inverse=True)
     number = number.ravel()
