@@ -39,4 +39,4 @@ def spacings(xy: Floats) -> Floats:
 
     flat = np.column_stack([xy, np.zeros(len(xy))])
     tree = small_gicp.KdTree(flat, 1)
-    return np.sqrt(np.asarray(tree.batch_knn_search(flat, 2, 1)[1])[:, 1])
+    return np.asarray(np.sqrt(np.asarray(tree.batch_knn_search(flat, 2, 1)[1])[:, 1]))
