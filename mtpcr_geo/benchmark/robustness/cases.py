@@ -283,6 +283,53 @@ class DiscClouds:
 
 
 @dataclass(frozen=True)
+class MirroredClouds:
+    """The reflected source of a pair, or a disc of it, against its target: there is no right answer.
+
+    Attributes:
+        folder, radius, place, seed: as of `DiscClouds`; all of the source if the radius is None.
+
+    """
+
+    folder: Path
+    radius: float | None = None
+    place: int = 0
+    seed: int = 0
+
+    def make(self) -> CommonFrame:
+        """Return the source reflected east to west about its middle, and the target."""
+        made: CommonFrame
+        if self.radius is None:
+            made = FolderClouds(self.folder).make()
+        else:
+            made = DiscClouds(self.folder, self.radius, self.place, self.seed).make()
+        middle = np.array([np.median(made.source[:, 0]), 0.0, 0.0])
+        return CommonFrame((made.source - middle) * [-1.0, 1.0, 1.0] + middle, made.target, made.cell_m)
+
+
+@dataclass(frozen=True)
+class ElsewhereClouds:
+    """A disc of a pair's source against what of the target lies elsewhere: there is no right answer.
+
+    Attributes:
+        folder, radius, place, seed: as of `DiscClouds`.
+
+    """
+
+    folder: Path
+    radius: float
+    place: int
+    seed: int = 0
+
+    def make(self) -> CommonFrame:
+        """Return the disc, and the target without what lies within twice its radius."""
+        made = DiscClouds(self.folder, self.radius, self.place, self.seed).make()
+        centre = (made.source.min(axis=0) + made.source.max(axis=0))[:2] / 2
+        away = ((made.target[:, :2] - centre) ** 2).sum(axis=1) > (2.0 * self.radius) ** 2
+        return CommonFrame(made.source, made.target[away], made.cell_m)
+
+
+@dataclass(frozen=True)
 class UnrelatedClouds:
     """The source of one pair against the target of another: there is no right answer.
 

@@ -11,6 +11,7 @@ from mtpcr_geo.benchmark.robustness.cases import CommonFrame
 from mtpcr_geo.benchmark.simulator.kinds import Kind
 from mtpcr_geo.benchmark.simulator.repeating import RepeatingKind, repeating_pair
 from mtpcr_geo.benchmark.simulator.scan_plots import PlotOptions, simulate_plot
+from mtpcr_geo.benchmark.simulator.symmetric import SymmetricKind, symmetric_pair
 from mtpcr_geo.benchmark.standins import StandIn, write_stand_in
 
 
@@ -46,6 +47,24 @@ class RepeatingClouds:
     def make(self) -> CommonFrame:
         """Sample both clouds."""
         return CommonFrame(*repeating_pair(self.kind, self.seed, apart=self.apart))
+
+
+@dataclass(frozen=True)
+class SymmetricClouds:
+    """Two scans of a site that looks the same when turned by 180 degrees.
+
+    Attributes:
+        kind, seed, apart: of `symmetric_pair`.
+
+    """
+
+    kind: SymmetricKind
+    seed: int
+    apart: bool = False
+
+    def make(self) -> CommonFrame:
+        """Sample both clouds."""
+        return CommonFrame(*symmetric_pair(self.kind, self.seed, apart=self.apart))
 
 
 @dataclass(frozen=True)

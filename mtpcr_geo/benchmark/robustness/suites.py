@@ -11,9 +11,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mtpcr_geo.benchmark.pairs import pair_folders
-from mtpcr_geo.benchmark.robustness.cases import PLACES, Case, DiscClouds, FolderClouds, UnrelatedClouds
-from mtpcr_geo.benchmark.robustness.simulated import PlotClouds, RepeatingClouds, SiteClouds, StandInClouds
-from mtpcr_geo.benchmark.simulator import repeating
+from mtpcr_geo.benchmark.robustness.cases import (
+    PLACES,
+    Case,
+    DiscClouds,
+    ElsewhereClouds,
+    FolderClouds,
+    MirroredClouds,
+    UnrelatedClouds,
+)
+from mtpcr_geo.benchmark.robustness.simulated import (
+    PlotClouds,
+    RepeatingClouds,
+    SiteClouds,
+    StandInClouds,
+    SymmetricClouds,
+)
+from mtpcr_geo.benchmark.simulator import repeating, symmetric
 from mtpcr_geo.benchmark.simulator.kinds import KINDS, Kind
 from mtpcr_geo.benchmark.simulator.scan_plots import plot_options
 from mtpcr_geo.benchmark.standins import stand_ins
@@ -28,6 +42,8 @@ UNCUT = ("forest_plot_mls_uas", "robot_scans")
 TILT_DEG = 10.0
 PLOTS: dict[Kind, int] = {"forest": 60, "town": 20, "farmland": 20}
 REPEATING_SEEDS = 10
+SYMMETRIC_SEEDS = 5
+ELSEWHERE_RADII_M = (25.0, 50.0)
 OVERLAPS = (0.4, 0.25, 0.15, 0.1, 0.07, 0.05, 0.03)
 
 
@@ -181,6 +197,44 @@ def _repeating_apart(options: SuiteOptions) -> Iterator[Case]:
     return _repeating(options, apart=True)
 
 
+def _symmetric(options: SuiteOptions) -> Iterator[Case]:
+    for kind in symmetric.KINDS:
+        for number in range(SYMMETRIC_SEEDS):
+            for apart in (False, True):
+                seed = 1000 * options.seed + number
+                yield Case(
+                    "symmetric", f"{kind}_{seed}", kind, SymmetricClouds(kind, seed, apart), seed,
+                    ranges=options.ranges, has_truth=not apart, place="apart" if apart else "",
+                )  # fmt: skip
+
+
+def _mirrored(options: SuiteOptions) -> Iterator[Case]:
+    for folder in options.folders():
+        cuts: list[tuple[float | None, int]] = [(None, 0)]
+        if folder.name not in UNCUT:
+            cuts += [(radius, place) for radius in ELSEWHERE_RADII_M for place in range(PLACES)]
+        for radius, place in cuts:
+            yield Case(
+                "mirrored", folder.name, "whole" if radius is None else "disc",
+                MirroredClouds(folder, radius, place, options.seed), options.seed,
+                ranges=options.ranges, has_truth=False, radius=radius,
+                place="" if radius is None else f"place{place}",
+            )  # fmt: skip
+
+
+def _elsewhere(options: SuiteOptions) -> Iterator[Case]:
+    for folder in options.folders():
+        if folder.name in UNCUT:
+            continue
+        for radius in ELSEWHERE_RADII_M:
+            for place in range(PLACES):
+                yield Case(
+                    "elsewhere", folder.name, "disc",
+                    ElsewhereClouds(folder, radius, place, options.seed), options.seed,
+                    ranges=options.ranges, has_truth=False, radius=radius, place=f"place{place}",
+                )  # fmt: skip
+
+
 def _standins(options: SuiteOptions) -> Iterator[Case]:
     for one in stand_ins(options.seed):
         case = Case(
@@ -208,11 +262,16 @@ SUITES: dict[str, Callable[[SuiteOptions], Iterator[Case]]] = {
     "swap": _swap,
     "repeating": _repeating,
     "repeating-apart": _repeating_apart,
+    "symmetric": _symmetric,
     "unrelated": _unrelated,
+    "mirrored": _mirrored,
+    "elsewhere": _elsewhere,
     "standins": _standins,
     "overlap": _overlap,
 }
 """The suites: pairs (real pairs, upright), tilts (the same, local and tilted), discs (cut from them), plots
 (simulated ground plots), swap (both ways), repeating (sites that repeat themselves), repeating-apart (without
-overlap), unrelated (other sites), standins and overlap (simulated, as `mtpcr-geo benchmark` has them).
+overlap), symmetric (sites that look the same when turned by half), unrelated (other sites), mirrored (the
+source reflected), elsewhere (discs against the target without their surroundings), standins and overlap
+(simulated, as `mtpcr-geo benchmark` has them).
 """
