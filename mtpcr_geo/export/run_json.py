@@ -9,7 +9,8 @@ for a name: a stage's tag, a role (source, target, result, work), a library.
 - ``reasons``: why: one sentence each
 - ``probability``: of being within 5 degrees and 2 m of the truth, as in the metrics; null from keypoints, or
   where nothing was judged
-- ``checks[].check``: what was checked, those that decide first; empty where nothing was judged
+- ``checks``: the table of checks, those that decide first; empty where nothing was judged
+- ``checks[].check``: what was checked
 - ``checks[].value``: what was found
 - ``checks[].wanted``: what is wanted
 - ``checks[].status``: passed, not passed, warning (not met, and the verdict does not depend on it), or not
