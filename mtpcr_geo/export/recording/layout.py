@@ -117,9 +117,7 @@ def _matches(recorded: Recorded) -> Any:
     if not recorded.has("hypotheses"):
         return rrb.Horizontal(matches, name="Matches")
     below = rrb.Horizontal(
-        rrb.BarChartView(
-            origin="hypotheses/scores", name="Strength of each candidate pose"
-        ),
+        rrb.BarChartView(origin="hypotheses/scores", name="Strength of each candidate pose"),
         rrb.TextDocumentView(origin="hypotheses/table", name="Candidate poses"),
     )
     return rrb.Vertical(matches, below, row_shares=[3, 1], name="Matches")

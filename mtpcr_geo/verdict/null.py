@@ -1,0 +1,42 @@
+"""How probable it is that a scene without a true pose scores as well: the tail of the mirrored search."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+TAIL = 5
+"""Strongest distinct hypotheses of the mirrored source that the tail is fitted to."""
+FEWEST = 3
+LEAST_SCALE = 1e-3
+
+
+def null_probability(strength: float | None, mirrored: Sequence[float] | None) -> float | None:
+    """Return the probability that the best of a search without a true pose is as strong.
+
+    The hypotheses of the mirrored source are distinct poses that are all wrong. Their strongest are the upper
+    order statistics of what chance and likeness give on this pair, over all yaws and shifts; above the next
+    one their logarithms fall off exponentially (Hill 1975, Annals of Statistics 3(5)), and the best of as
+    many again exceeds a strength with a probability of the Fréchet law.
+
+    Args:
+        strength: of the best hypothesis.
+        mirrored: strengths of the mirrored source's hypotheses, in any order.
+
+    Returns:
+        0 to 1; None where there are too few hypotheses.
+
+    """
+    if strength is None or mirrored is None:
+        return None
+    top = np.sort(np.array([value for value in mirrored if value > 0.0], np.float64))[::-1][: TAIL + 1]
+    if strength <= 0.0:
+        return 1.0
+    if len(top) < FEWEST:
+        return None
+    logs = np.log(top)
+    base, above = logs[-1], logs[:-1]
+    scale = max(float((above - base).mean()), LEAST_SCALE)
+    beyond = np.exp(-(np.log(strength) - base) / scale)
+    return float(-np.expm1(-len(above) * min(beyond, 1e6)))
