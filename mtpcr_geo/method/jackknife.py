@@ -17,7 +17,7 @@ from mtpcr_geo.core.arrays import Floats, Indices
 from mtpcr_geo.core.equations import BlockEquations
 from mtpcr_geo.method.icp import Surfaces
 
-MOST_BLOCKS, FEWEST_BLOCKS = 32, 8
+MOST_BLOCKS, FEWEST_BLOCKS = 16, 8
 FEWEST_IN_BLOCK = 40
 """Correspondences that a block must have: below that its own noise hides what it has in common."""
 QUARTERS = 4

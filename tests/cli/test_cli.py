@@ -232,7 +232,7 @@ def test_a_registering_pipeline_names_each_file_once(town_files, tmp_path):
     result = run("pipeline", "-", stdin=dumped.encode())
     assert result.exit_code == 0
     lines = result.stdout.splitlines()
-    assert lines[0] .startswith("Accepted: ")
+    assert lines[0].startswith("Accepted: ")
     written = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert written
     for path in written:
