@@ -49,6 +49,8 @@ def judged(name: str) -> Pair:
     evidence, more = gather(pair)
     verdict = assess(evidence, LIMITS[name], more)
     assert verdict.name == name, verdict.reasons
+    assert pair.T_target_source is not None
+    assert pair.tie_points is not None
     agreeing = tie_point_agrees(pair, pair.T_target_source, evidence.tolerance_m)
     return pair.with_(verdict=verdict, tie_points=replace(pair.tie_points, inlier=agreeing))
 
