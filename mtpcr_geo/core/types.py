@@ -216,6 +216,7 @@ class Matches(ComparesArrays):
         support: share of the patches in the overlap that agree on the pose; None likewise.
         strength: of the best hypothesis, score times support; None from matchers that have none.
         null_ratio: strength of the best hypothesis over the best of the mirrored source; None likewise.
+        mirrored_strengths: strengths of the mirrored source's hypotheses; None where it was not searched.
         report: further figures of the matcher, for the audit only.
         source_keypoints, target_keypoints: (k, 2) pixels of all keypoints, matched or not; None from
             matchers that have none.
@@ -233,6 +234,7 @@ class Matches(ComparesArrays):
     support: float | None = None
     null_ratio: float | None = None
     strength: float | None = None
+    mirrored_strengths: tuple[float, ...] | None = None
     report: Mapping[str, Any] = field(default_factory=dict)
     source_keypoints: Floats | None = None
     target_keypoints: Floats | None = None

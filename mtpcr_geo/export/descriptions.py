@@ -31,6 +31,8 @@ _LABELS = {
     "held_out_median_m": "median residual of held-out tie points, plan",
     "neg_log10_p": "significance of that (-log10 p)",
     "hypothesis_margin": "times stronger than the next distinct pose",
+    "null_ratio": "times stronger than the best of the mirrored source",
+    "null_p": "probability that a scene without a right pose scores as well",
     "patch_support": "patches that agree on the pose",
     "overlap_m2": "ground that both see",
     "overlap_source": "overlap, share of the source",

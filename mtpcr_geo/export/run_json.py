@@ -9,7 +9,8 @@ for a name: a stage's tag, a role (source, target, result, work), a library.
 - ``reasons``: why: one sentence each
 - ``probability``: of being within 5 degrees and 2 m of the truth, as in the metrics; null from keypoints, or
   where nothing was judged
-- ``checks[].check``: what was checked, those that decide first; empty where nothing was judged
+- ``checks``: the table of checks, those that decide first; empty where nothing was judged
+- ``checks[].check``: what was checked
 - ``checks[].value``: what was found
 - ``checks[].wanted``: what is wanted
 - ``checks[].status``: passed, not passed, warning (not met, and the verdict does not depend on it), or not
@@ -89,6 +90,8 @@ The metrics:
 - ``metrics.patch_support``: share of the patches in the overlap that agree on the pose; null from keypoints
 - ``metrics.null_ratio``: how many times stronger the pose is than the best of the mirrored source, which has
   no right pose; null from keypoints
+- ``metrics.null_p``: probability that the best hypothesis of a scene without a right pose is as strong, from
+  the tail of the mirrored source's; null where there are too few, and from keypoints
 - ``metrics.overlap_m2``: ground that both clouds see
 - ``metrics.overlap_source``: the same as a share of the source's ground, 0 to 1
 - ``metrics.overlap_target``: the same as a share of the target's ground, 0 to 1

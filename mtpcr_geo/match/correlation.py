@@ -129,6 +129,7 @@ def match(
         support=best.support,
         null_ratio=null_ratio,
         strength=best.strength,
+        mirrored_strengths=None if twin is None else tuple(c.strength for c in twin.pool.candidates),
         report=report,
     )
 

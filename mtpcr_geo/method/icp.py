@@ -214,6 +214,12 @@ class Surfaces:
         gap = np.einsum("ij,ij->i", normal, self._t[nearest] - moved)
         return float((gap**2 / (gap**2 + MEETS_M**2)).mean())
 
+    @cached_property
+    def _covariances(self) -> tuple[Floats, Floats]:
+        """Covariances that GICP gives the points of source and target, (n, 3, 3) and (m, 3, 3)."""
+        source, target = (np.asarray(cloud.covs())[:, :3, :3] for cloud in (self._source, self._target))
+        return source, target
+
     @property
     def pivot(self) -> Floats:
         """Origin near the middle of the overlap, (3,) target work coordinates, metres."""
@@ -236,8 +242,8 @@ class Surfaces:
         chosen, moved = chosen[near_by], moved[near_by]
         partner = np.asarray(nearest)[near_by, 0].astype(np.int64)
         R = X[:3, :3]
-        spread = np.asarray(self._source.covs())[chosen, :3, :3]
-        spread = R @ spread @ R.T + np.asarray(self._target.covs())[partner, :3, :3]
+        of_source, of_target = self._covariances
+        spread = R @ of_source[chosen] @ R.T + of_target[partner]
         return Correspondences(chosen, moved, self._t[partner] - moved, np.linalg.inv(spread))
 
     def _with_surfaces(self, cloud: Any) -> Any:

@@ -17,13 +17,13 @@ from mtpcr_geo.core.arrays import Floats, Indices
 from mtpcr_geo.core.equations import BlockEquations
 from mtpcr_geo.method.icp import Surfaces
 
-MOST_BLOCKS, FEWEST_BLOCKS = 32, 8
+MOST_BLOCKS, FEWEST_BLOCKS = 16, 8
 FEWEST_IN_BLOCK = 40
 """Correspondences that a block must have: below that its own noise hides what it has in common."""
 QUARTERS = 4
-QUARTER_STEPS = 4
+QUARTER_STEPS = 3
 """Rounds of new correspondences in which a quarter of the overlap is solved by itself."""
-MOST_CORRESPONDENCES = 20_000
+MOST_CORRESPONDENCES = 8_000
 RIDGE = 1e-9
 """Share of the mean information added to a block's, so that one that sees no motion along a direction asks
 for none along it."""

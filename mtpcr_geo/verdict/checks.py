@@ -99,7 +99,11 @@ def _mirrored(evidence: Evidence, limits: Limits) -> Check:
     if evidence.null_ratio is None:
         return Check("mirrored source", "not searched", f"{limits.null_ratio:g} times", None, meaning)
     value, wanted = beside(evidence.null_ratio, limits.null_ratio, 2)
-    return Check("mirrored source", f"{value} times", f"at least {wanted} times", True, meaning)
+    chance = ""
+    if evidence.null_p is not None:
+        chance = ", p less than 0.001" if evidence.null_p < 0.001 else f", p {evidence.null_p:.2g}"
+        meaning += " p is the probability that the best of a scene without a right pose is as strong."
+    return Check("mirrored source", f"{value} times{chance}", f"at least {wanted} times", True, meaning)
 
 
 def _tie_points(evidence: Evidence, limits: Limits) -> Check:

@@ -19,6 +19,7 @@ from mtpcr_geo.method.shortcomings import what_is_missing
 from mtpcr_geo.method.solve import solve_tie_points
 from mtpcr_geo.verdict.further import with_further
 from mtpcr_geo.verdict.limits import Evidence
+from mtpcr_geo.verdict.null import null_probability
 
 GROUND_AGREES_M = 0.5
 UNBOUNDED_CELLS = 2.0
@@ -76,6 +77,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         refined_away_m=_refined_away(pair, T),
         refinement_lost=icp is not None and icp.lost_tie_points,
         null_ratio=matches.null_ratio if matches is not None else None,
+        null_p=None if matches is None else null_probability(matches.strength, matches.mirrored_strengths),
         least_overlap_m2=_least_overlap_m2(pair),
         final_agreeing=int((residual < tolerance).sum()),
         missing=_missing(pair),

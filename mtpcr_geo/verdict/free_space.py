@@ -15,7 +15,7 @@ SOLID_ABOVE_M = 2.5
 """Metres above the ground from which a cell without anything lower counts as solid: a storey."""
 INSIDE_CELLS = 1
 """Cells by which a solid is shrunk, so that eaves and half a cell of misfit are no conflict."""
-FLAT_M = 3.0
+ROOF_SPREAD_M = 3.0
 """Most spread of heights in a solid cell, rise within it: a roof, and no crown."""
 FEWEST_CELLS = 20
 
@@ -66,7 +66,7 @@ def free_space_of(overlap: Overlap) -> FreeSpace:
 def _inside(low: Image, top: Image, floor: Image, ground: Mask) -> Mask:
     """Mark the cells whose lowest point is a storey above the ground, and all around which are such too."""
     with np.errstate(invalid="ignore"):
-        high = ~ground & (low - floor > SOLID_ABOVE_M) & (top - low < FLAT_M)
+        high = ~ground & (low - floor > SOLID_ABOVE_M) & (top - low < ROOF_SPREAD_M)
     window = np.ones((2 * INSIDE_CELLS + 1, 2 * INSIDE_CELLS + 1), np.uint8)
     return np.asarray(cv2.erode(high.astype(np.uint8), window) > 0)
 

@@ -40,6 +40,7 @@ class Evidence:
         final_agreeing: of all tie points, those that agree with the final transform; None if not counted.
         refinement_lost: whether surfaces fit better where the tie points do not agree, and the tie points
             were followed.
+        null_p: probability that the best of a scene without a true pose is as strong; None likewise.
         uncertainty: of the pose; None where too little agrees to tell.
         quarters_m: how far apart the quarters of the overlap, each solved by itself, put their middles in
             plan, and what is wanted at most, metres; None where that is not known.
@@ -75,6 +76,7 @@ class Evidence:
     rivals: tuple[Rival, ...] = ()
     mapped: bool = True
     not_levelled: tuple[str, ...] = ()
+    null_p: float | None = None
     uncertainty: Uncertainty | None = None
     quarters_m: tuple[float, float] | None = None
     free_space: float | None = None

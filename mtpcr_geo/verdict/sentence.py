@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from mtpcr_geo.core.types import VerdictName
@@ -24,26 +25,36 @@ def sentence_of(
         name: of the verdict.
         probability: of being right; None where it is not known.
         uncertainty: of the pose; None where it is not known.
-        reasons: of the verdict; the first is given where no probability is.
+        reasons: of the verdict; the first is given where it is not accepted, or no probability is known.
         mapped: whether the target's frame has east and north.
 
     """
-    right = (
-        f"the pose is right, within 5 degrees and 2 m, with {chance_text(probability)}"
-        if probability is not None
-        else reasons[0]
-    )
-    return f"{name.capitalize()}: {right}; {_accuracy(name, uncertainty, mapped)}."
+    chance = "" if probability is None else chance_text(probability)
+    if name == "accepted" and chance:
+        judged = f"the pose is right, within 5 degrees and 2 m, with {chance}"
+    else:
+        # what it fails by; the advice that follows it stands with the reasons
+        judged = reasons[0].partition("; ")[0]
+        if chance and "probability" not in judged:
+            judged += f", though the evidence as a whole gives {chance} of being within 5 degrees and 2 m"
+    return f"{name.capitalize()}: {judged}; {_accuracy(name, uncertainty, mapped)}."
+
+
+def centimetres(value_m: float) -> str:
+    """Print a bound in metres to the centimetre above it: what is below it is below what is printed."""
+    return f"{max(math.ceil(100.0 * value_m - 1e-9), 1) / 100.0:.2f}"
 
 
 def _accuracy(name: VerdictName, uncertainty: Uncertainty | None, mapped: bool) -> str:
     if name == "refused":
-        return "a refused pose has no accuracy"
+        return "no accuracy is claimed for a refused pose"
     if uncertainty is None:
         return "its accuracy is not known"
     known = uncertainty.metrics
-    middle = f"{known['within_95_plan_m']:.2f} m in plan and {known['within_95_height_m']:.2f} m in height"
-    far = f"{known['within_95_plan_far_m']:.2f} m and {known['within_95_height_far_m']:.2f} m"
+    plan, height, plan_far, height_far = (
+        centimetres(known[f"within_95_{one}_m"]) for one in ("plan", "height", "plan_far", "height_far")
+    )
+    middle, far = f"{plan} m in plan and {height} m in height", f"{plan_far} m and {height_far} m"
     condition = "" if name == "accepted" else "if it is right, "
     weakest = direction_text(known["weakest_direction_deg"], mapped)
     return (

@@ -126,7 +126,7 @@ def test_exit_code_says_the_verdict(verdict, code, town_files, tmp_path, monkeyp
     out = tmp_path / "out"
     result = run("register", *town_files, "-o", out, "--no-recording")
     assert result.exit_code == code
-    assert verdict.upper() in result.stdout
+    assert f"{verdict.capitalize()}: " in result.stdout
     assert "because" in result.stdout
     assert (out / "registered.laz").exists() == (verdict == "doubtful")
     assert (out / "transform.json").exists() == (verdict == "doubtful")
@@ -232,7 +232,7 @@ def test_a_registering_pipeline_names_each_file_once(town_files, tmp_path):
     result = run("pipeline", "-", stdin=dumped.encode())
     assert result.exit_code == 0
     lines = result.stdout.splitlines()
-    assert lines[0] .startswith("Accepted: ")
+    assert lines[0].startswith("Accepted: ")
     written = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert written
     for path in written:

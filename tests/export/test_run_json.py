@@ -23,6 +23,8 @@ RARE = {
     "mtpcr.level <role>.header_remarks",
     "frames",  # null where no pair was made
     "metrics",  # empty where there is no verdict
+    "checks",  # likewise
+    "uncertainty",  # null where too little agrees
     "metrics.vertical_offset_m",
     *(f"rivals[].{key}" for key in ("east_m", "north_m", "turn_deg", "margin", "far")),  # on doubtful sites
     "mtpcr.focus why",

@@ -28,7 +28,8 @@ def test_surprise_is_the_binomial_tail() -> None:
 def test_good_evidence_is_accepted_with_its_grounds() -> None:
     verdict = assess(GOOD, Limits())
     assert verdict.name == "accepted"
-    assert "34 of 40" in verdict.reasons[0]
+    assert "34 held-out tie points agree" in verdict.reasons[0]
+    assert "chance would make 2 of 40" in verdict.reasons[0]
 
 
 @pytest.mark.parametrize(

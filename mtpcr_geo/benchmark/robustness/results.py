@@ -15,6 +15,7 @@ import numpy as np
 from mtpcr_geo.benchmark.metrics import rotation_error_deg
 from mtpcr_geo.benchmark.robustness.coverage import covered
 from mtpcr_geo.benchmark.robustness.runner import COLUMNS, Row
+from mtpcr_geo.benchmark.robustness.uniformity import null_uniformity
 from mtpcr_geo.benchmark.tables import to_markdown
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import InputError, OptionError, OutputError
@@ -227,6 +228,7 @@ def report(rows: Sequence[Row]) -> str:
         for line in covered([row for row in right if row["suite"] == suite])
     ]
     for title, lines in (
+        ("Without a right answer: share of probabilities below p", null_uniformity(rows)),
         ("True errors within the region of 95 %, right runs", coverage),
         ("Spread over starts", spreads(rows)),
         ("Both ways", swaps(rows)),

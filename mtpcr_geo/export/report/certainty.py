@@ -67,6 +67,8 @@ def error_map(pair: Pair, figure: Figure) -> str:
     """Return the expected error in plan over the source's extent, as a picture with its range."""
     if pair.verdict is None or pair.verdict.uncertainty is None or pair.T_target_source is None:
         return ""
+    if pair.verdict.name == "refused":
+        return ""  # no accuracy is claimed
     picture, low, high = expected_error_picture(pair, pair.verdict.uncertainty)
     rows = "".join(
         f"<tr><td>{escape(a)}</td><td>{escape(b)}</td></tr>"
@@ -87,7 +89,7 @@ def expected_error_picture(
     Args:
         pair: with a transform.
         uncertainty: of that.
-        side: pixels along the longer side.
+        side: pixels along the longer side at most; fewer where points are sparse.
 
     Returns:
         The picture, north up, and the least and greatest value, metres.
@@ -97,7 +99,8 @@ def expected_error_picture(
     moved = transforms.apply(pair.T_target_source, pair.source.sample)
     level: Floats = (moved - uncertainty.pivot) @ uncertainty.R_level.T
     low, high = level[:, :2].min(axis=0), level[:, :2].max(axis=0)
-    cell = max(float((high - low).max()) / side, 1e-6)
+    spacing = float(np.sqrt(np.prod(high - low) / max(len(level), 1)))
+    cell = max(float((high - low).max()) / side, 2.0 * spacing, 1e-6)
     column, row = np.floor((level[:, :2] - low) / cell).astype(np.int64).T
     height, width = int(row.max()) + 1, int(column.max()) + 1
     _, first = np.unique(row * width + column, return_index=True)

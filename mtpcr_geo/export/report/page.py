@@ -44,6 +44,7 @@ pre{background:var(--soft);padding:10px;overflow-x:auto;font-size:12.5px;line-he
 ul{margin:6px 0;padding-left:20px}
 .key{display:inline-block;width:11px;height:11px;border-radius:2px;margin:0 4px 0 10px}
 .small{font-size:13px;color:#51606d;white-space:normal}
+table.checks td:last-child{white-space:nowrap}
 table.checks td:first-child{max-width:560px;color:var(--text)}
 .ok{color:#1a7a40}.warn{color:#a06c00;font-weight:600}.bad{color:#c0261c;font-weight:600}.none{color:#51606d}
 details{margin:10px 0}summary{cursor:pointer;color:#51606d}
