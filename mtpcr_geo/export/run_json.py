@@ -126,6 +126,8 @@ The metrics:
 - ``metrics.held_out_expected``: held-out tie points that chance would make agree; null from keypoints
 - ``metrics.solid_cells``: cells inside roofs of one cloud that the other fills
 - ``metrics.free_space_conflicts``: of these, cells in which the other sees the ground
+- ``metrics.objects_missing``: share of what stands higher than 2.5 m in one cloud at whose place the other
+  sees bare ground only, in the direction in which it is less; null where too little stands in the overlap
 - ``metrics.sigma_plan_m``: standard deviation of the middle of the overlap in plan, along its weakest
   direction; this and what follows are null or missing where too little agrees to tell
 - ``metrics.sigma_height_m``: standard deviation of its height
@@ -219,6 +221,8 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
   of them; null where too little ground is compared
 - ``mtpcr.match mirrored_strengths``: score times support of the hypotheses of the mirrored source; null where
   it was not searched
+- ``mtpcr.match self_likeness``: correlation of the scene under the best hypothesis with itself, moved: a
+  scene that repeats itself has 0.4 and more
 - ``mtpcr.match null_ratio``: score times support of the best hypothesis over the best of these
 - ``mtpcr.match verticals[].source``: what the source was levelled by, where several verticals were tried
 - ``mtpcr.match verticals[].target``: the same of the target

@@ -33,7 +33,7 @@ def checks_of(
 
     """
     makers: tuple[Callable[[Evidence, Limits], Check], ...] = (
-        _margin, _mirrored, _tie_points, _refinement, _ground_heights, _ground_shape, _shared,
+        _margin, _mirrored, _tie_points, _refinement, _ground_heights, _ground_shape, _objects, _shared,
     )  # fmt: skip
     checks = [_probability(evidence, limits, probability), *(make(evidence, limits) for make in makers)]
     decided = [
@@ -171,6 +171,18 @@ def _shared(evidence: Evidence, limits: Limits) -> Check:
         True,
         "area of the cells that both clouds fill under the transform.",
     )
+
+
+def _objects(evidence: Evidence, limits: Limits) -> Check:
+    meaning = (
+        "share of what stands higher than 2.5 m in one cloud at whose place the other sees bare ground only, "
+        "in the direction in which it is less."
+    )
+    share = evidence.objects_missing
+    if share is None:
+        return Check("objects", "too few", f"at most {limits.objects_missing:.0%} missing", None, meaning)
+    value, wanted = percent(share, limits.objects_missing)
+    return Check("objects", f"{value} missing", f"at most {wanted}", True, meaning)
 
 
 def _warnings(evidence: Evidence) -> tuple[Check, ...]:

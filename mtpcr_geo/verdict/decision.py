@@ -27,6 +27,7 @@ from mtpcr_geo.verdict.findings import (
     margin_finding,
     neg_log10_p_of,
     null_finding,
+    objects_finding,
     overlap_finding,
     probability_finding,
     refinement_findings,
@@ -63,6 +64,7 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
         "refinement": [*refinement_findings(evidence, limits)],
         "ground heights": [ground_finding(evidence, limits)],
         "ground shape": [ground_shape_finding(evidence, limits)],
+        "objects": [objects_finding(evidence, limits)],
         "shared ground": [overlap_finding(evidence, limits)],
     }
     judged_so = {name: [found for found in some if found is not None] for name, some in judgements.items()}
@@ -108,6 +110,7 @@ def metrics_of(evidence: Evidence) -> dict[str, Any]:
         "ground_checked": ground_checked(evidence),
         "ground_spread_m": evidence.ground_spread_m,
         "ground_relief_m": evidence.ground_relief_m,
+        "objects_missing": evidence.objects_missing,
         "refined_away_m": evidence.refined_away_m,
         "refinement_lost": evidence.refinement_lost,
     }

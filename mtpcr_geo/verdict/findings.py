@@ -243,6 +243,18 @@ def ground_shape_finding(evidence: Evidence, limits: Limits) -> CheckFinding | N
     )
 
 
+def objects_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
+    """Judge whether what stands in one cloud stands in the other too."""
+    share = evidence.objects_missing
+    if share is None or share <= limits.objects_missing:
+        return None
+    value, wanted = percent(share, limits.objects_missing)
+    return CheckFinding(
+        f"at the place of {value} of what stands in one cloud the other sees bare ground (at most {wanted} "
+        "is expected): the place is wrong, or much was built or felled in between"
+    )
+
+
 def null_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
     """Judge the strength of the pose against what a mirrored source reaches."""
     if evidence.null_ratio is None or evidence.null_ratio >= limits.null_ratio:

@@ -51,7 +51,7 @@ def with_further(
         "solid_cells": free.cells,
         "free_space_conflicts": free.conflicts,
     }
-    evidence = replace(evidence, free_space=free.share)
+    evidence = replace(evidence, free_space=free.share, objects_missing=free.missing)
     equations = equations_of_pair(pair, ground, evidence.tolerance_m)
     if equations is None:
         return evidence, metrics

@@ -46,6 +46,8 @@ class Evidence:
             plan, and what is wanted at most, metres; None where that is not known.
         free_space: share of the cells of solids of one cloud in which the other sees the ground; None where
             there are too few.
+        objects_missing: share of one cloud's objects at whose place the other sees bare ground only, see
+            `free_space.missing_share`; None where there are too few.
         sliding: the motion in plan that the fit tells least; None where that is not known.
         drift: how what is left bends along the overlap; None where that is not known.
         contradictions: what was known beforehand and is not so, a sentence each.
@@ -80,6 +82,7 @@ class Evidence:
     uncertainty: Uncertainty | None = None
     quarters_m: tuple[float, float] | None = None
     free_space: float | None = None
+    objects_missing: float | None = None
     sliding: Sliding | None = None
     drift: Drift | None = None
 
@@ -104,6 +107,7 @@ class Limits:
         ground_shape: most spread of the height differences between both grounds, as a share of the relief
             that they have, to accept. Of two places that have nothing to do with each other it is 1.4; under
             true poses of repeating sites it is 0.2 at most, under wrong ones 1.0 to 1.7.
+        objects_missing: greatest share of objects missing in the other cloud to accept.
 
     """
 
@@ -118,3 +122,4 @@ class Limits:
     refined_away: float = 2.0
     ground_agreeing: float = 0.7
     ground_shape: float = 0.35
+    objects_missing: float = 0.12

@@ -25,10 +25,12 @@ RELIEF_NOISE_M = 0.05
 """Added to spread and relief of the ground: what is below it is noise."""
 GROUND_CLEAR = (-1.0, 2.5)
 GROUND_EXPECTED = 0.7
+MOST_MISSING = 0.5
+"""Share of missing objects beyond which more says no more."""
 TIE_POINTS_PER_PATCH = 4
 """Patches overlap by half, so about four tie points tell what one independent tie would."""
 
-FEATURES = ("margin", "null", "agreement", "ground_shape", "ground_agreement", "refinement")
+FEATURES = ("margin", "null", "agreement", "ground_shape", "ground_agreement", "refinement", "objects")
 """The evidence, as numbers that grow with what speaks for a pose:
 
 - margin: logarithm of the strength over that of the next distinct pose;
@@ -36,7 +38,8 @@ FEATURES = ("margin", "null", "agreement", "ground_shape", "ground_agreement", "
 - agreement: logarithm of the significance of the held-out tie points, overlapping ones counted once;
 - ground_shape: logarithm of the ground's relief over the spread of the height differences;
 - ground_agreement: share of the common ground that agrees, over what flat ground of any place reaches;
-- refinement: -1 where surfaces fit better where the tie points do not agree.
+- refinement: -1 where surfaces fit better where the tie points do not agree;
+- objects: minus the share of one cloud's objects at whose place the other sees bare ground.
 """
 
 
@@ -69,6 +72,7 @@ def features_of(metrics: Mapping[str, Any]) -> Floats | None:
             shape,
             share if metrics.get("ground_checked") else 0.0,
             -1.0 if metrics.get("refinement_lost") else 0.0,
+            -min(metrics.get("objects_missing") or 0.0, MOST_MISSING),
         ]
     )
 

@@ -211,3 +211,26 @@ def test_the_null_is_uniform_where_the_tails_are_alike() -> None:
 def _searched(rng: np.random.Generator) -> tuple[float, list[float]]:
     """The best of 90 wrong poses, and the strongest of 90 others."""
     return float(np.exp(0.4 * rng.exponential(size=90)).max()), list(np.exp(0.4 * rng.exponential(size=90)))
+
+
+def test_trees_of_another_place_are_missing_and_those_of_one_are_not() -> None:
+    rng = np.random.default_rng(3)
+    ground = np.column_stack([rng.uniform(0, 120, (60_000, 2)), np.zeros(60_000)])
+
+    def wood(places: np.ndarray) -> np.ndarray:
+        crowns = (places[:, None, :] + rng.uniform(-3, 3, (len(places), 150, 2))).reshape(-1, 2)
+        return np.vstack([ground, np.column_stack([crowns, rng.uniform(4, 8, len(crowns))])])
+
+    places = rng.uniform(5, 115, (30, 2))
+    here, there = wood(places), wood(rng.uniform(5, 115, (30, 2)))
+    same = free_space_of(overlap_of(wood(places), here)).missing
+    other = free_space_of(overlap_of(there, here)).missing
+    assert same is not None
+    assert other is not None
+    assert same < 0.02
+    assert other > 0.3
+    # a scanner on the ground that sees no crowns contradicts nothing that the other sees above it
+    below = free_space_of(overlap_of(np.vstack([ground, here[60_000:62_000]]), here)).missing
+    assert below is not None
+    assert below < 0.02
+    assert free_space_of(overlap_of(ground, ground)).missing is None
