@@ -71,7 +71,16 @@ def bounds_findings(cloud: LasCloud, whole: Floats, role: Role) -> Iterator[Find
         return
     outside = np.maximum(cloud.minimum - low, high - cloud.maximum)
     spare = np.maximum(low - cloud.minimum, cloud.maximum - high)
-    if (outside > tolerance).any():
+    if (outside > tolerance).any() and not np.any([cloud.minimum, cloud.maximum]):
+        yield Finding(
+            "warning",
+            "bounds-wrong",
+            role,
+            "the header's bounds are all zero: the points are used, and programs that trust the header will "
+            "not find them",
+            rewrite(cloud.path),
+        )
+    elif (outside > tolerance).any():
         axis = int((outside / tolerance).argmax())
         yield Finding(
             "warning",

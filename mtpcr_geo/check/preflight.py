@@ -220,14 +220,16 @@ class _Check:
         found += points.stray_findings(inspection.scan, role)
         try:
             link = _frame_of(inspection, "local" if inspection.seems_local else declared, local)
-            if link.file_crs is None and link.scanner.unit is None:
-                with self.stopping("unit", role) if inspection.is_local else suppress(InputError):
-                    check_unit(cloud.name, role, inspection.scan.sample, cloud.count)
             sample = link.to_work(inspection.scan.sample)
         except (CrsError, InputError):
-            return  # reported where the common frame is settled, or in the guess at a missing CRS
-        if self.refusals and self.findings[-1].code == "unit":
-            return
+            return  # reported where the common frame is settled
+        if link.file_crs is None and link.scanner.unit is None:
+            try:
+                check_unit(cloud.name, role, inspection.scan.sample, cloud.count)
+            except InputError as error:
+                if inspection.is_local:
+                    self.refuse(error, "unit", role)
+                return  # else it stands in the guess at a missing CRS
         try:
             dense = coverage_of(sample, points=cloud.count)
         except RegistrationError as error:
@@ -283,6 +285,7 @@ class _Check:
             self.relation = pair.by_area(source, target)
         if self.relation.name != "overlapping":
             self.findings += pair.swapped_findings(source, target)
+        self.findings += pair.lookalike_findings(source, target)
         self.findings += pair.result_findings(source, target)
         self.findings += pair.exchanged_findings(source, target)
         self.findings += pair.same_points_findings(source, target)
@@ -326,11 +329,10 @@ class _Check:
             link.to_work(scan.sample) for link, scan in ((to_source, source.scan), (to_target, target.scan))
         ]
         if frame.crs is None or source.is_local or target.is_local:
-            local = " and the ".join(
-                inspection.role for inspection in (source, target) if inspection.is_local
-            )
+            local = [inspection.role for inspection in (source, target) if inspection.is_local]
+            which = "both have" if len(local) > 1 else f"the {local[0]} has"
             self.relation = pair.Relation(
-                "unknown", why=f"the {local} has local coordinates; registering finds its place"
+                "unknown", why=f"{which} local coordinates; registering finds the place of the source"
             )
             return
         overlap: Overlap | None
@@ -352,6 +354,9 @@ class _Check:
             for inspection in self.inspections.values()
             if inspection.measured is not None
         ]
+        # one that lies on its side is levelled first, or turned by an option
+        on_side = {found.role for found in self.findings if found.code == "lies-on-its-side"}
+        sides = [(one, measured) for one, measured in sides if one.role not in on_side]
         if self.refusals or not sides:
             return
         clouds = [

@@ -76,7 +76,8 @@ def relation_text(relation: Relation) -> str:
     if relation.name == "unknown":
         return f"whether they overlap is not known: {relation.why}"
     if relation.name == "apart":
-        return f"by their CRSs they are {distance_text(relation.distance_m or 0.0)} apart"
+        middles = " from middle to middle" if relation.by_middles else ""
+        return f"by their CRSs they are {distance_text(relation.distance_m or 0.0)} apart{middles}"
     return (
         f"by their CRSs they overlap: {relation.overlap_m2:,.0f} m2, "
         f"{relation.source_share:.0%} of the source and {relation.target_share:.0%} of the target"
