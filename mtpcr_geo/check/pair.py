@@ -304,8 +304,8 @@ def result_findings(source: Inspection, target: Inspection) -> Iterator[Finding]
             "warning",
             "exchanged",
             "both",
-            "the source has a CRS, and the target looks local: are they the wrong way round? It is the source "
-            "that moves, and the result would have local coordinates",
+            "the source has a CRS, and the target looks local: are they the wrong way round? It is the "
+            "source that moves, and the result would have local coordinates",
             "name the local cloud first, and the one with the CRS second",
         )
 

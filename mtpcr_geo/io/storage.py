@@ -61,8 +61,10 @@ def settled(cloud: Cloud, move: Move | None, scales: Floats, coarsest: Floats | 
     some = np.concatenate(looked)
     middle, half = np.rint((low + high) / 2), (high - low) / 2 + 1.0
     grown = scales.copy()
-    while coarsest is not None and (half / grown > MOST_STEPS).any() and (grown < coarsest).any():
-        grown = np.minimum(grown * 10, np.maximum(coarsest, scales))
+    while coarsest is not None and ((half / grown > MOST_STEPS) & (grown < coarsest)).any():
+        # each axis by itself: a wide plan shall not cost the heights their digits
+        coarser = np.minimum(grown * 10, np.maximum(coarsest, scales))
+        grown = np.where(half / grown > MOST_STEPS, coarser, grown)
     if (half / grown <= MOST_STEPS).all():
         return Storage(grown, middle)
     # the finer scale again: a few points far away shall not cost the others their digits

@@ -65,7 +65,7 @@ def cells_short(
         extent_m: edge of a square of the smaller cloud's occupied area, metres.
         role: which cloud that is.
         per_m2: points per occupied square metre of the sparser cloud.
-        spread_m: edge of a square of the ground over which that cloud is spread, with its empty cells, metres.
+        spread_m: edge of a square of the ground over which that cloud is spread, holes included, metres.
 
     """
     across = extent_m / cell_m
@@ -74,8 +74,8 @@ def cells_short(
     size = f"the {role} is about {extent_m:.0f} m across, {across:.0f} cells of {cell_m:g} m"
     if spread_m > SPREAD * extent_m:
         size = (
-            f"the {role} is spread over {spread_m:.0f} x {spread_m:.0f} m, and holds points in no more cells of "
-            f"{cell_m:g} m than a square of {across:.0f} x {across:.0f} has"
+            f"the {role} is spread over {spread_m:.0f} x {spread_m:.0f} m, and holds points in no more cells "
+            f"of {cell_m:g} m than a square of {across:.0f} x {across:.0f} has"
         )
     borne = max(float(np.sqrt(POINTS_PER_CELL / max(per_m2, 1e-9))), FINEST_AUTO_CELL_M)
     if cell_m > COARSER * borne:
