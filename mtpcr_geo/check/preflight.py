@@ -105,6 +105,9 @@ def check_clouds(
     target_unit: Unit | None = None,
     source_axes: Axes = "z-up",
     target_axes: Axes = "z-up",
+    source_text: str | None = None,
+    target_text: str | None = None,
+    scale: float | None = None,
     local: bool = False,
     vertical: Vertical = "refuse",
     near: tuple[float, float] | None = None,
@@ -124,6 +127,8 @@ def check_clouds(
         target_crs: CRS of the target, likewise.
         source_unit, target_unit: units of local clouds, if not metres.
         source_axes, target_axes: which of their axes points up.
+        source_text, target_text: layouts of clouds that are text, as `read` takes them.
+        scale: step of the coordinates of the LAS file that would be written.
         local: both clouds are local.
         vertical: what to do with different vertical datums.
         near: place near which the middle of the source lies, in the target's CRS.
@@ -141,7 +146,8 @@ def check_clouds(
         raise OptionError("--near-crs and --within are of use with --near only; give --near X Y")
     if near is not None and target is None:
         raise OptionError("--near is a place in the target, and there is one cloud; give a second one")
-    check = _Check()
+    check = _Check(scale)
+    texts: dict[CloudRole, str | None] = {"source": source_text, "target": target_text}
     files: list[tuple[CloudRole, str | Path, str | None]]
     files = [("source", source, source_crs if target is not None else source_crs or target_crs)]
     if target is not None:
@@ -153,7 +159,7 @@ def check_clouds(
     }
     for role, path, text in files:
         with check.stopping("input", role):
-            cloud = open_any(path)
+            cloud = open_any(path, text=texts[role])
             check.inspections[role] = Inspection(
                 role, cloud, place.claim_of(cloud, text, local, scanners[role]), scanner=scanners[role]
             )
@@ -175,7 +181,8 @@ def check_clouds(
 class _Check:
     """A check in progress: what was inspected, found and refused so far."""
 
-    def __init__(self) -> None:
+    def __init__(self, scale: float | None = None) -> None:
+        self.scale = scale
         self.inspections: dict[CloudRole, Inspection] = {}
         self.findings: list[Finding] = []
         self.refusals: list[MtpcrError] = []
@@ -218,6 +225,8 @@ class _Check:
         found += points.noise_findings(inspection.scan, role)
         found += points.no_return_findings(inspection.scan, role)
         found += points.stray_findings(inspection.scan, role)
+        metres = header.scales_in_metres(np.ones(3), claim.facts) if claim.facts is not None else np.ones(3)
+        found += points.precision_findings(cloud, inspection.scan, metres, role)
         try:
             link = _frame_of(inspection, "local" if inspection.seems_local else declared, local)
             sample = link.to_work(inspection.scan.sample)
@@ -242,7 +251,10 @@ class _Check:
             sample, low, high, float(link.origin[2]), dense.per_m2, dense.occupied_m2
         )
         found += points.plan_findings(inspection.measured, role)
-        found += points.storage_findings(link, inspection.scan, role)
+        found += points.storage_findings(link, inspection.scan, role, self.scale)
+        if self.scale is not None and role == "source":
+            with self.stopping("scale", role):
+                points.check_scale(link, inspection.scan, self.scale)
         if inspection.is_local or inspection.seems_local:
             found += upright.upright_findings(sample, role)
         upright_as_it_is = not any(one.role == role and one.code == "lies-on-its-side" for one in found)

@@ -67,14 +67,17 @@ def settled(cloud: Cloud, move: Move | None, scales: Floats, coarsest: Floats | 
         grown = np.where(half / grown > MOST_STEPS, coarser, grown)
     if (half / grown <= MOST_STEPS).all():
         return Storage(grown, middle)
+    # beams without a return lie at one place, however many they are
+    places = np.unique(some, axis=0)
     # the finer scale again: a few points far away shall not cost the others their digits
     for wanted in (scales, grown):
-        offsets = np.rint(np.median(some, axis=0))
-        misfit = (np.abs(some - offsets) / wanted > MOST_STEPS).any(axis=1)
+        offsets = np.rint(np.median(places, axis=0))
+        misfit = (np.abs(places - offsets) / wanted > MOST_STEPS).any(axis=1)
         if misfit.mean() <= FEW_SHARE:
             return Storage(wanted, offsets)
-    distance = float(np.abs(some - offsets).max())
+    distance = float(np.abs(places - offsets).max())
     raise OutputError(
         f"{misfit.mean():.0%} of the points, up to {distance:.0f} from the others, do not fit a LAS file at "
-        f"scale {grown.min():g}; give a coarser scale (scale_x ... of writers.las), or take them apart"
+        f"scale {grown.min():g}; give a coarser one (--scale; scale_x ... of writers.las in a pipeline), or "
+        "take them apart"
     )

@@ -12,8 +12,9 @@ from mtpcr_geo.cli import app as cli
 from mtpcr_geo.cli import options as verbs
 from mtpcr_geo.cli.parameters import help_of, shown_fields, spelling
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.pipeline.options import GROUPS, RegisterOptions
+from mtpcr_geo.pipeline.options import RegisterOptions
 from mtpcr_geo.pipeline.registry import stage_types
+from mtpcr_geo.pipeline.shown import GROUPS
 
 MODELS: dict[str, type[BaseModel]] = {
     "register": verbs.RegisterVerb,
