@@ -104,13 +104,15 @@ def bounds_findings(cloud: LasCloud, whole: Floats, role: Role) -> Iterator[Find
         )
 
 
-def check_scale(link: FrameLink, scan: Scan, scale: float) -> None:
+def check_scale(link: FrameLink, scan: Scan, scale: float | None) -> None:
     """Refuse a scale at which a LAS file does not hold the cloud.
 
     Raises:
         OutputError: naming the finest one that does.
 
     """
+    if scale is None:
+        return
     corners = link.to_work(box_points(scan.bounds, 2))
     apart = float(np.linalg.norm(np.ptp(corners, axis=0)))
     if apart / 2 > scale * MOST_STEPS:
@@ -155,7 +157,7 @@ def storage_findings(link: FrameLink, scan: Scan, role: Role, scale: float | Non
     except CrsError:
         return  # noise or marks at a place where the CRS means nothing
     apart = float(np.ptp(corners, axis=0).max())
-    if role != "target" and not apart / 2 <= step * MOST_STEPS:
+    if not apart / 2 <= step * MOST_STEPS:
         yield Finding(
             "note",
             "points-far",

@@ -42,6 +42,7 @@ class CheckReport:
         clouds: facts of each cloud, by role; a file that cannot be opened is not in it.
         relation: where they lie to each other; None for one cloud.
         findings: errors first.
+        files: the file of each cloud that was asked for, by role.
         exit_code: 0 where `register` would go on, else the code with which it would end.
 
     """
@@ -49,6 +50,7 @@ class CheckReport:
     clouds: dict[CloudRole, CloudFacts] = field(default_factory=dict)
     relation: pair.Relation | None = None
     findings: tuple[Finding, ...] = ()
+    files: dict[CloudRole, str] = field(default_factory=dict)
     exit_code: int = 0
 
     @property
@@ -158,6 +160,7 @@ def check_clouds(
         "target": Scanner(target_unit, target_axes),
     }
     for role, path, text in files:
+        check.files[role] = str(path)
         with check.stopping("input", role):
             cloud = open_any(path, text=texts[role])
             check.inspections[role] = Inspection(
@@ -185,6 +188,7 @@ class _Check:
         self.scale = scale
         self.inspections: dict[CloudRole, Inspection] = {}
         self.findings: list[Finding] = []
+        self.files: dict[CloudRole, str] = {}
         self.refusals: list[MtpcrError] = []
         self.relation: pair.Relation | None = None
         self.common: tuple[Floats, Floats] | None = None
@@ -251,10 +255,10 @@ class _Check:
             sample, low, high, float(link.origin[2]), dense.per_m2, dense.occupied_m2
         )
         found += points.plan_findings(inspection.measured, role)
-        found += points.storage_findings(link, inspection.scan, role, self.scale)
-        if self.scale is not None and role == "source":
+        if role == "source":
             with self.stopping("scale", role):
                 points.check_scale(link, inspection.scan, self.scale)
+                found += points.storage_findings(link, inspection.scan, role, self.scale)
         if inspection.is_local or inspection.seems_local:
             found += upright.upright_findings(sample, role)
         upright_as_it_is = not any(one.role == role and one.code == "lies-on-its-side" for one in found)
@@ -391,5 +395,6 @@ class _Check:
             {role: describe(inspection) for role, inspection in in_order},
             self.relation,
             by_severity(self.findings),
+            dict(sorted(self.files.items())),
             self.refusals[0].exit_code if self.refusals else 0,
         )

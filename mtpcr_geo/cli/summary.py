@@ -33,6 +33,7 @@ _SHOWN = (
 )
 _OPEN_WITH = {
     "registered": "the moved cloud",
+    "registered_also": "the moved cloud, for other programs",
     "report": "the report, in any browser",
     "recording": "the recording, with: rerun",
     "tie_points": "tie points and footprints, in QGIS",

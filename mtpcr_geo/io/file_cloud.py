@@ -178,6 +178,6 @@ def precision_remark(cloud: Cloud, xyz: Floats) -> str | None:
     if step is None or float(step.max()) < COARSE_SINGLE:
         return None
     return (
-        f"its coordinates are single-precision numbers, in steps of {step.max():.2g} where they are as large as "
-        f"{np.abs(xyz).max():,.0f}: what is finer was lost when it was written"
+        f"its coordinates are single-precision numbers, in steps of {step.max():.2g} where they are as large "
+        f"as {np.abs(xyz).max():,.0f}: what is finer was lost when it was written"
     )

@@ -44,7 +44,7 @@ def write_other(
         path: where to write; the ending is the format.
         cloud: what to write.
         move: takes (n, 3) file coordinates of `cloud` to those to be written; None leaves them.
-        crs: CRS of the written coordinates; only E57 states it, and text has the digits that degrees need.
+        crs: CRS of the written coordinates, for the digits that degrees need; these formats state none.
         advance: called with the number of points of each chunk written.
 
     Returns:
@@ -222,10 +222,6 @@ def _write_e57(path: Path, columns: _Columns, crs: CRS | None, advance: Any) -> 
     held = {"x", "y", "z", "point_source_id", intensity, *(_COLOURS if colours else ())}
     scans = records["point_source_id"] if "point_source_id" in names else np.zeros(len(records), np.uint16)
     with pye57.E57(str(path), mode="w") as file:
-        if crs is not None:
-            node = pye57.libe57.StringNode(file.image_file, crs.to_wkt())
-            if not file.root.isDefined("coordinateMetadata"):
-                file.root.set("coordinateMetadata", node)
         for number in np.unique(scans):
             part = records[scans == number]
             xyz = np.column_stack([part[axis] for axis in "xyz"])
@@ -238,7 +234,7 @@ def _write_e57(path: Path, columns: _Columns, crs: CRS | None, advance: Any) -> 
                 data |= {f"color{one.title()}": part[one].astype(np.uint8) for one in _COLOURS}
             file.write_scan_raw(data, name=f"scan {number}", translation=middle)
             advance(len(part))
-    return (*columns.left_out, *(name for name in names if name not in held))
+    return (*columns.left_out, *(name for name in names if name not in held and records[name].any()))
 
 
 Writer = Callable[[Path, _Columns, "CRS | None", Callable[[int], object]], tuple[str, ...]]
