@@ -222,7 +222,7 @@ class _Check:
         whole = inspection.bounds if inspection.scan is None else inspection.scan.whole
         if isinstance(cloud, LasCloud):
             found += header.header_findings(cloud, claim.facts, role, whole)
-        if claim.facts is not None:
+        if claim.facts is not None and cloud.count:
             found += place.area_findings(claim.facts, inspection.bounds, role)
         if inspection.scan is None:
             return

@@ -16,7 +16,7 @@ from mtpcr_geo.io.many import ManyFiles, output_names
 from mtpcr_geo.io.memory import cloud_of, coordinates, is_array
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.io.views import Moved
-from mtpcr_geo.io.write_any import check_ending, write_any
+from mtpcr_geo.io.write_any import ENDINGS, check_ending, write_any
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.arrays import Floats
@@ -196,8 +196,9 @@ def write_moved(
         clouds = moved.base.parts
         names = output_names([Path(part.name) for part in clouds])
         parts = [(out_path / name, part) for name, part in zip(names, clouds, strict=True)]
-        if out_path.is_file():
-            raise InputError(f"{out_path} is a file, and {len(parts)} files are moved; name a folder")
+        if out_path.is_file() or out_path.suffix.lower() in ENDINGS:
+            files = "1 file is" if len(parts) == 1 else f"{len(parts)} files are"
+            raise InputError(f"{out_path} is a file by its name, and {files} moved to a folder; name one")
     else:
         check_ending(out_path)
     with OutputSet(overwrite) as outputs:
