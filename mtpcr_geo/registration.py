@@ -19,25 +19,25 @@ import numpy as np
 from pydantic import ValidationError
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.cloud import ArrayCloud, Cloud
-from mtpcr_geo.core.errors import InputError, MissingPartError, OptionError, RegistrationError
+from mtpcr_geo.core.cloud import Cloud
+from mtpcr_geo.core.errors import MissingPartError, OptionError, RegistrationError
 from mtpcr_geo.core.progress import Progress
 from mtpcr_geo.core.types import Floats, Pair, Verdict
 from mtpcr_geo.core.uncertainty import Uncertainty
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.export.apply import move, moved_by, write_moved
-from mtpcr_geo.io.memory import cloud_of, coordinates, is_array
+from mtpcr_geo.io.memory import cloud_of, coordinates
 from mtpcr_geo.pipeline.options import OUTPUT_NAMES, RegisterOptions, first_problem
 from mtpcr_geo.pipeline.records import StageRecord
 from mtpcr_geo.pipeline.runner import RunResult, run
-from mtpcr_geo.pipeline.stage import Stage, chained
-from mtpcr_geo.pipeline.stages.memory import MemoryReader
+from mtpcr_geo.pipeline.stage import chained
+from mtpcr_geo.pipeline.stages.memory import check_two, crs_of_arrays
 from mtpcr_geo.pipeline.stages.steps import (
-    part_names,
-    reader_of,
+    further_files,
+    readers_of,
     recording_writer,
     steps_of,
-    writers_of,
+    writers_for,
 )
 
 if TYPE_CHECKING:
@@ -64,14 +64,14 @@ class Registration:
     def __init__(
         self,
         result: RunResult,
-        *,
-        force: bool = False,
+        options: RegisterOptions | None = None,
         recording: Path | None = None,
     ) -> None:
         self.verdict = result.verdict or Verdict("refused", ("the pipeline judged nothing",), {})
         self.pair: Pair | None = result.pair
         self.report: Sequence[StageRecord] = result.done
-        self.force = force
+        self._options = options or RegisterOptions()
+        self.force = self._options.force
         self._result = result
         self._recording = recording
         self.outputs: dict[str, Path] = {}
@@ -223,8 +223,9 @@ class Registration:
             InputError: if an input file has changed since.
 
         """
-        parts = part_names(self.pair.source.cloud) if self.pair is not None else []
-        stages = writers_of(Path(folder), force=force or self.force, recording=self._recording, parts=parts)
+        options = self._options.model_copy(update={"force": force or self.force, "recording": False})
+        source = self.pair.source.cloud if self.pair is not None else None
+        stages = writers_for(source, Path(folder), options, self._recording)
         taken = {stage.tag for stage in stages}
         last = [
             tag
@@ -232,7 +233,9 @@ class Registration:
             if value is self.pair and value is not None and tag not in taken
         ]
         nodes = chained(stages, tuple(last[-1:]))
-        self._note(run(nodes, overwrite=overwrite, progress=progress, before=self._result))
+        earlier = further_files(Path(folder)) if self._recording is None else []
+        again = run(nodes, overwrite=overwrite, progress=progress, before=self._result, replaces=earlier)
+        self._note(again)
         return self.outputs
 
     def _note(self, result: RunResult) -> None:
@@ -300,20 +303,19 @@ def register(
     chosen = read_options({"recording": out is not None, **options})
     if out is None and chosen.overwrite:
         raise OptionError("overwrite is of use with a folder only: give out, or save(folder, overwrite=True)")
-    readers = [reader_of(target, "target"), reader_of(source, "source")]
-    _check_two(readers)
-    chosen = chosen.model_copy(update=_crs_of_arrays(chosen, source, target))
+    readers = readers_of(source, target, chosen)
+    check_two(readers)
+    chosen = chosen.model_copy(update=crs_of_arrays(chosen, source, target))
     steps = chained(steps_of(chosen), ("target", "source"))
     nodes = [*chained(readers[:1]), *chained(readers[1:]), *steps]
     if out is not None:
-        parts = part_names(source)
-        writers = writers_of(Path(out), force=chosen.force, recorded=chosen.recording, parts=parts)
+        writers = writers_for(source, Path(out), chosen)
         nodes += chained(writers, (nodes[-1].tag,))
-        recording = Path(out) / OUTPUT_NAMES["recording"]
-        result = run(nodes, overwrite=chosen.overwrite, progress=progress, replaces=[recording])
-        return Registration(result, force=chosen.force)
+        earlier = further_files(Path(out))
+        result = run(nodes, overwrite=chosen.overwrite, progress=progress, replaces=earlier)
+        return Registration(result, chosen)
     if not chosen.recording:
-        return Registration(run(nodes, progress=progress), force=chosen.force)
+        return Registration(run(nodes, progress=progress), chosen)
     # kept in a temporary folder until it is saved; deleted together with the registration
     folder = Path(tempfile.mkdtemp(prefix="mtpcr-geo-"))
     nodes += chained([recording_writer(folder)], (nodes[-1].tag,))
@@ -322,7 +324,7 @@ def register(
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
-    return Registration(result, force=chosen.force, recording=folder / OUTPUT_NAMES["recording"])
+    return Registration(result, chosen, recording=folder / OUTPUT_NAMES["recording"])
 
 
 def apply(
@@ -332,6 +334,7 @@ def apply(
     *,
     inverse: bool = False,
     overwrite: bool = False,
+    scale: float | None = None,
     progress: Progress | None = None,
 ) -> Floats | Cloud | Path:
     """Move points by the transform of a registration.
@@ -340,9 +343,10 @@ def apply(
         transform: a registration, or the ``transform.json`` of one.
         points: (n, 3) coordinates in the source's CRS and units (in the target's with `inverse`); or a file,
             `laspy.LasData` or `Cloud`.
-        out: a LAS, LAZ or COPC file to write the moved cloud to; nothing is written if not given.
+        out: a file to write the moved cloud to, its ending the format; nothing is written if not given.
         inverse: go from target to source.
         overwrite: replace `out` if it is there.
+        scale: storage step of a LAS file, in units of its CRS.
         progress: where to report the points written.
 
     Returns:
@@ -366,7 +370,7 @@ def apply(
         return move(chain, points, inverse=inverse)
     moved = moved_by(chain, cloud_of(points, "points"), inverse=inverse)
     reads = [Path(one) for one in (transform, points) if isinstance(one, str | os.PathLike)]
-    write_moved(Path(out), moved, overwrite=overwrite, reads=reads, progress=progress)
+    write_moved(Path(out), moved, overwrite=overwrite, reads=reads, progress=progress, scale=scale)
     return Path(out)
 
 
@@ -374,10 +378,9 @@ def build_pipeline(
     source: str | Path, target: str | Path, out: str | Path, options: RegisterOptions
 ) -> list[dict[str, Any]]:
     """Name the stages of a registration of two files, as pipeline JSON; defaults are left out."""
-    readers = [reader_of(target, "target"), reader_of(source, "source")]
+    readers = readers_of(source, target, options)
     steps = chained(steps_of(options), ("target", "source"))
-    parts = part_names(source)
-    writers = writers_of(Path(out), force=options.force, recorded=options.recording, parts=parts)
+    writers = writers_for(source, Path(out), options)
     nodes = [*chained(readers[:1]), *chained(readers[1:]), *steps, *chained(writers, (steps[-1].tag,))]
     # a single input is the stage before
     return [
@@ -404,34 +407,6 @@ def registration_of(result: RunResult) -> Registration:
     return Registration(result)
 
 
-def _check_two(readers: Sequence[Stage]) -> None:
-    """Refuse one cloud given as both: it would fit itself perfectly. Files are compared when they are read.
-
-    Raises:
-        InputError: if both are the same.
-
-    """
-    clouds = [reader.cloud for reader in readers if isinstance(reader, MemoryReader)]
-    if len(clouds) < 2:
-        return
-    first, second = clouds
-    same = first is second
-    if isinstance(first, ArrayCloud) and isinstance(second, ArrayCloud):
-        same = same or np.array_equal(first.xyz, second.xyz)
-    if same:
-        raise InputError("source and target hold the same points; give two different clouds")
-
-
-def _crs_of_arrays(options: RegisterOptions, source: CloudLike, target: CloudLike) -> dict[str, str]:
-    """Return the CRS options of bare arrays for which no CRS is named: local."""
-    named = {"source": options.source_crs, "target": options.target_crs}
-    return {
-        f"{role}_crs": "local"
-        for role, cloud in (("source", source), ("target", target))
-        if named[role] is None and not options.local and is_array(cloud)
-    }
-
-
 def _by_name(paths: Sequence[Path]) -> dict[str, Path]:
     """Return files of a registration by what they are; of a source of many files, the folder of the moved."""
     return {_name_of(path): path.parent if _is_part(path) else path for path in paths}
@@ -441,6 +416,8 @@ def _name_of(path: Path) -> str:
     if _is_part(path):
         return "registered"
     names = {path.name: name for name, path in OUTPUT_NAMES.items()}
+    if path.name.startswith("registered.") and path.name not in names and path.parent.name != "bev":
+        return "registered_also"
     names |= {f"{role}.tif": f"bev_{role}" for role in ("source", "target", "registered")}
     return names.get(path.name, path.stem)
 

@@ -26,6 +26,7 @@ from mtpcr_geo.core.errors import (
     RegistrationError,
 )
 from mtpcr_geo.core.types import Pair, Verdict
+from mtpcr_geo.pipeline.options import RegisterOptions
 from mtpcr_geo.pipeline.records import InputFile, RunFacts
 from mtpcr_geo.pipeline.runner import RunResult
 from mtpcr_geo.registration import Registration
@@ -49,7 +50,7 @@ def bits(registration: Registration) -> bytes:
 
 def of_pair(pair: Pair, *, force: bool = False) -> Registration:
     """A registration that ended in the given state."""
-    return Registration(RunResult({"assess": pair}, (), ()), force=force)
+    return Registration(RunResult({"assess": pair}, (), ()), RegisterOptions(force=force))
 
 
 @pytest.fixture(scope="module")

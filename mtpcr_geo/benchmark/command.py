@@ -13,7 +13,8 @@ from mtpcr_geo.cli.options import Quiet as QuietOption
 from mtpcr_geo.cli.parameters import command_of
 from mtpcr_geo.cli.shared import Quiet, progress_bars
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.pipeline.options import RUN, Overwrite, Shown
+from mtpcr_geo.pipeline.options import Overwrite
+from mtpcr_geo.pipeline.shown import RUN, Shown
 
 if TYPE_CHECKING:
     from mtpcr_geo.benchmark.robustness.suites import SuiteOptions

@@ -15,6 +15,11 @@ CloudRole = Literal["source", "target"]
 Role = CloudRole | Literal["both"]
 
 _ORDER = ("error", "warning", "note", "source", "target", "both")
+ABOUT_FILES = frozenset(
+    ("wkt-bit-unset", "wkt-bit-wrong", "wkt-missing", "legacy-count", "return-counts", "gps-time")
+    + ("extra-dimensions", "bounds-wide", "offset-far", "scale-fine", "epoch-missing")
+)
+"""Codes of findings about how a file is written, which change nothing in a registration."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +50,16 @@ def finding_of(error: MtpcrError, code: str, role: Role) -> Finding:
 
 
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Sort findings: errors before warnings before notes, and of these the source's before the target's."""
-    return tuple(sorted(findings, key=lambda found: (_ORDER.index(found.severity), _ORDER.index(found.role))))
+    """Sort findings by what matters first.
+
+    Errors before warnings before notes; of these, what bears on a registration before what is about how a
+    file is written; then the source's before the target's.
+    """
+
+    def place(found: Finding) -> tuple[int, bool, int]:
+        return _ORDER.index(found.severity), found.code in ABOUT_FILES, _ORDER.index(found.role)
+
+    return tuple(sorted(findings, key=place))
 
 
 def rewrite(path: object, **options: float) -> str:

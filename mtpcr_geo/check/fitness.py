@@ -67,7 +67,8 @@ def fitness_findings(sides: list[Fitness]) -> Iterator[Finding]:
     sparser = min(side.measured.per_m2 for side in sides)
     extent = float(np.sqrt(smaller.measured.area_m2))
     hardly = extent / cell < HARDLY_ANY_ACROSS
-    short = cells_short(cell, extent, "cloud" if len(sides) < 2 else smaller.role, sparser)
+    spread = float(np.sqrt(np.prod(smaller.measured.extent[:2])))
+    short = cells_short(cell, extent, "cloud" if len(sides) < 2 else smaller.role, sparser, spread)
     if short is not None:
         what, _, fix = short.partition(": ")
         risk = "too few for the result to be sure" if hardly else "few for the result to be sure"

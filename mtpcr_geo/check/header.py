@@ -132,7 +132,7 @@ def _crs_records(cloud: LasCloud, raw: RawHeader, role: Role) -> Iterator[Findin
             "wkt-bit-unset",
             role,
             f"the global encoding's WKT bit is not set, which point format {point_format} asks for",
-            again,
+            again if cloud.crs is not None else "",
         )
 
 

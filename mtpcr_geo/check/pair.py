@@ -41,6 +41,7 @@ class Relation:
         overlap_m2: ground that both see; None where unknown.
         source_share, target_share: share of each cloud's ground that both see.
         why: why it is not known, or "".
+        by_middles: whether the distance is that of their middles.
 
     """
 
@@ -50,6 +51,7 @@ class Relation:
     source_share: float | None = None
     target_share: float | None = None
     why: str = ""
+    by_middles: bool = False
 
 
 def relate(source: Floats, target: Floats) -> tuple[Relation, Overlap | None]:
@@ -109,7 +111,7 @@ def by_area(source: Inspection, target: Inspection) -> Relation:
     distance = float(Geod(ellps="WGS84").line_length(middles[0::2], middles[1::2]))
     if distance < FARTHEST_APART:
         return Relation("unknown", why="their CRSs do not go together")
-    return Relation("apart", distance, 0.0, 0.0, 0.0)
+    return Relation("apart", distance, 0.0, 0.0, 0.0, by_middles=True)
 
 
 def _spacing(xyz: Floats) -> float:
@@ -154,6 +156,8 @@ def relation_findings(relation: Relation, smaller_m2: float) -> Iterator[Finding
 
 def distance_text(metres: float) -> str:
     """Put a distance in metres or kilometres."""
+    if metres >= 100_000:
+        return f"{metres / 1000:,.0f} km"
     return f"{metres / 1000:,.1f} km" if metres >= 1000 else f"{metres:.1f} m"
 
 
@@ -252,6 +256,39 @@ def link_findings(source: FrameLink, target: FrameLink) -> Iterator[Finding]:
         yield Finding("note", "vertical-taken", "both", note)
 
 
+def lookalike_findings(source: Inspection, target: Inspection) -> Iterator[Finding]:
+    """Yield that a cloud without a CRS has coordinates where those of the other one lie."""
+    from mtpcr_geo.check.place import code_of
+
+    box = [source.bounds[:, :2], target.bounds[:, :2]]
+    apart = np.maximum(box[0][0] - box[1][1], box[1][0] - box[0][1])
+    unknown = [one for one in (source, target) if one.claim.facts is None and one.cloud.crs is None]
+    if not unknown or not (apart < 0).all() or all(one.seems_local for one in (source, target)):
+        return
+    if len(unknown) > 1:
+        yield Finding(
+            "note",
+            "same-coordinates",
+            "both",
+            "as they stand their coordinates overlap: they seem to be in one CRS",
+            "name it for both (--source-crs and --target-crs)",
+        )
+        return
+    (one,) = unknown
+    other = target if one is source else source
+    facts = other.claim.facts
+    if facts is None or not facts.georeferenced:
+        return
+    code = code_of(facts.crs)
+    yield Finding(
+        "note",
+        "same-coordinates",
+        one.role,
+        f"its coordinates lie where those of the {other.role} do: it seems to be in its CRS, {facts.name}",
+        f"give --{one.role}-crs {code or 'with that of the ' + other.role}, if it is",
+    )
+
+
 def result_findings(source: Inspection, target: Inspection) -> Iterator[Finding]:
     """Yield that a result has no CRS, where the target has none and the source does."""
     if target.is_local and source.claim.facts is not None and not source.is_local:
@@ -261,6 +298,15 @@ def result_findings(source: Inspection, target: Inspection) -> Iterator[Finding]
             "target",
             "it is local, so that the result has local coordinates and no CRS, though the source has one",
             "exchange the two clouds, if the result shall be in the source's CRS",
+        )
+    elif target.seems_local and source.claim.facts is not None and source.claim.facts.georeferenced:
+        yield Finding(
+            "warning",
+            "exchanged",
+            "both",
+            "the source has a CRS, and the target looks local: are they the wrong way round? It is the "
+            "source that moves, and the result would have local coordinates",
+            "name the local cloud first, and the one with the CRS second",
         )
 
 

@@ -133,13 +133,15 @@ def claim_findings(
     """
     if declared is None and not local and cloud.crs is None:
         option = "--source-crs" if one else f"--{role}-crs"
+        unit = unit_by_size(bounds[1] - bounds[0], cloud.count) if np.isfinite(bounds).all() else None
+        and_unit = f" and --{'source' if one else role}-unit {unit}" if unit in ("mm", "cm") else ""
         yield Finding(
             "error",
             "crs-missing",
             role,
             f"no coordinate reference system is known ({cloud.crs_problem or 'the file states none'})"
             f"{_guess(bounds, cloud.count)}",
-            f"give {option} EPSG:..., or {option} local if its coordinates are local",
+            f"give {option} EPSG:..., or {option} local{and_unit} if its coordinates are local",
         )
     elif cloud.crs is not None and cloud.crs_problem and claim.by != "option":
         yield Finding(

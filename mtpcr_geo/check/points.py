@@ -10,8 +10,9 @@ import numpy as np
 
 from mtpcr_geo.check.findings import Finding, Role, rewrite
 from mtpcr_geo.core.arrays import ComparesArrays, Floats
-from mtpcr_geo.core.errors import CrsError
+from mtpcr_geo.core.errors import CrsError, OutputError
 from mtpcr_geo.core.frames import box_points
+from mtpcr_geo.io.file_cloud import COARSE_SINGLE, FileCloud, single_precision_step
 from mtpcr_geo.io.sample import bounds_tolerance
 from mtpcr_geo.io.storage import MOST_STEPS
 from mtpcr_geo.io.write import STEP
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from mtpcr_geo.io.sample import Scan
 
 
+VERY_COARSE_SINGLE_M = 0.05
 MUCH_NOISE, VERY_MUCH_NOISE = 0.05, 0.3
 TALLEST_M = 1500.0
 TALLEST_GROWN_OR_BUILT_M = 120.0
@@ -71,7 +73,16 @@ def bounds_findings(cloud: LasCloud, whole: Floats, role: Role) -> Iterator[Find
         return
     outside = np.maximum(cloud.minimum - low, high - cloud.maximum)
     spare = np.maximum(low - cloud.minimum, cloud.maximum - high)
-    if (outside > tolerance).any():
+    if (outside > tolerance).any() and not np.any([cloud.minimum, cloud.maximum]):
+        yield Finding(
+            "warning",
+            "bounds-wrong",
+            role,
+            "the header's bounds are all zero: the points are used, and programs that trust the header will "
+            "not find them",
+            rewrite(cloud.path),
+        )
+    elif (outside > tolerance).any():
         axis = int((outside / tolerance).argmax())
         yield Finding(
             "warning",
@@ -93,21 +104,67 @@ def bounds_findings(cloud: LasCloud, whole: Floats, role: Role) -> Iterator[Find
         )
 
 
-def storage_findings(link: FrameLink, scan: Scan, role: Role) -> Iterator[Finding]:
+def check_scale(link: FrameLink, scan: Scan, scale: float | None) -> None:
+    """Refuse a scale at which a LAS file does not hold the cloud.
+
+    Raises:
+        OutputError: naming the finest one that does.
+
+    """
+    if scale is None:
+        return
+    corners = link.to_work(box_points(scan.bounds, 2))
+    apart = float(np.linalg.norm(np.ptp(corners, axis=0)))
+    if apart / 2 > scale * MOST_STEPS:
+        finest = 10.0 ** np.ceil(np.log10(apart / 2 / MOST_STEPS))
+        raise OutputError(
+            f"at --scale {scale:g} a LAS file spans {2 * scale * MOST_STEPS:,.0f} m, and the source "
+            f"{apart:,.0f} m; give --scale {finest:g} or coarser"
+        )
+
+
+def precision_findings(cloud: object, scan: Scan, metres: Floats, role: Role) -> Iterator[Finding]:
+    """Yield that coordinates are single-precision numbers, and too coarse where they are large.
+
+    Args:
+        cloud: the file; LAS has whole numbers, whatever they were made of.
+        scan: its points.
+        metres: (3,) a unit of x, y and z.
+        role: which cloud it is.
+
+    """
+    step = single_precision_step(scan.sample)
+    if step is None or not isinstance(cloud, FileCloud):
+        return
+    worst = float((step * metres).max())
+    if worst < COARSE_SINGLE:
+        return
+    yield Finding(
+        "warning" if worst >= VERY_COARSE_SINGLE_M else "note",
+        "single-precision",
+        role,
+        f"its coordinates are single-precision numbers, in steps of {worst:.2g} m where they are as large as "
+        f"{np.abs(scan.sample).max():,.0f}: what is finer was lost when it was written",
+        "export it in double precision, or shifted to a local origin",
+    )
+
+
+def storage_findings(link: FrameLink, scan: Scan, role: Role, scale: float | None) -> Iterator[Finding]:
     """Yield that some points lie too far from the others to be stored with them in one file."""
+    step = STEP if scale is None else scale
     try:
         corners = link.to_work(box_points(scan.whole, 2))
     except CrsError:
         return  # noise or marks at a place where the CRS means nothing
     apart = float(np.ptp(corners, axis=0).max())
-    if role != "target" and not apart / 2 <= STEP * MOST_STEPS:
+    if not apart / 2 <= step * MOST_STEPS:
         yield Finding(
             "note",
             "points-far",
             role,
             f"some of its points lie {apart / 1000:,.0f} km from others: those that do not fit a LAS file at "
-            f"a scale of {STEP:g} m will be left out of what is written, and counted",
-            "remove them beforehand, or write with a coarser scale (scale_x ... of writers.las)",
+            f"a scale of {step:g} m will be left out of what is written, and counted",
+            f"remove them beforehand, or give a coarser scale (--scale {10 * step:g})",
         )
 
 

@@ -42,6 +42,7 @@ class CheckReport:
         clouds: facts of each cloud, by role; a file that cannot be opened is not in it.
         relation: where they lie to each other; None for one cloud.
         findings: errors first.
+        files: the file of each cloud that was asked for, by role.
         exit_code: 0 where `register` would go on, else the code with which it would end.
 
     """
@@ -49,6 +50,7 @@ class CheckReport:
     clouds: dict[CloudRole, CloudFacts] = field(default_factory=dict)
     relation: pair.Relation | None = None
     findings: tuple[Finding, ...] = ()
+    files: dict[CloudRole, str] = field(default_factory=dict)
     exit_code: int = 0
 
     @property
@@ -105,6 +107,9 @@ def check_clouds(
     target_unit: Unit | None = None,
     source_axes: Axes = "z-up",
     target_axes: Axes = "z-up",
+    source_text: str | None = None,
+    target_text: str | None = None,
+    scale: float | None = None,
     local: bool = False,
     vertical: Vertical = "refuse",
     near: tuple[float, float] | None = None,
@@ -124,6 +129,8 @@ def check_clouds(
         target_crs: CRS of the target, likewise.
         source_unit, target_unit: units of local clouds, if not metres.
         source_axes, target_axes: which of their axes points up.
+        source_text, target_text: layouts of clouds that are text, as `read` takes them.
+        scale: step of the coordinates of the LAS file that would be written.
         local: both clouds are local.
         vertical: what to do with different vertical datums.
         near: place near which the middle of the source lies, in the target's CRS.
@@ -141,7 +148,8 @@ def check_clouds(
         raise OptionError("--near-crs and --within are of use with --near only; give --near X Y")
     if near is not None and target is None:
         raise OptionError("--near is a place in the target, and there is one cloud; give a second one")
-    check = _Check()
+    check = _Check(scale)
+    texts: dict[CloudRole, str | None] = {"source": source_text, "target": target_text}
     files: list[tuple[CloudRole, str | Path, str | None]]
     files = [("source", source, source_crs if target is not None else source_crs or target_crs)]
     if target is not None:
@@ -152,8 +160,9 @@ def check_clouds(
         "target": Scanner(target_unit, target_axes),
     }
     for role, path, text in files:
+        check.files[role] = str(path)
         with check.stopping("input", role):
-            cloud = open_any(path)
+            cloud = open_any(path, text=texts[role])
             check.inspections[role] = Inspection(
                 role, cloud, place.claim_of(cloud, text, local, scanners[role]), scanner=scanners[role]
             )
@@ -175,9 +184,11 @@ def check_clouds(
 class _Check:
     """A check in progress: what was inspected, found and refused so far."""
 
-    def __init__(self) -> None:
+    def __init__(self, scale: float | None = None) -> None:
+        self.scale = scale
         self.inspections: dict[CloudRole, Inspection] = {}
         self.findings: list[Finding] = []
+        self.files: dict[CloudRole, str] = {}
         self.refusals: list[MtpcrError] = []
         self.relation: pair.Relation | None = None
         self.common: tuple[Floats, Floats] | None = None
@@ -211,23 +222,27 @@ class _Check:
         whole = inspection.bounds if inspection.scan is None else inspection.scan.whole
         if isinstance(cloud, LasCloud):
             found += header.header_findings(cloud, claim.facts, role, whole)
-        if claim.facts is not None:
+        if claim.facts is not None and cloud.count:
             found += place.area_findings(claim.facts, inspection.bounds, role)
         if inspection.scan is None:
             return
         found += points.noise_findings(inspection.scan, role)
         found += points.no_return_findings(inspection.scan, role)
         found += points.stray_findings(inspection.scan, role)
+        metres = header.scales_in_metres(np.ones(3), claim.facts) if claim.facts is not None else np.ones(3)
+        found += points.precision_findings(cloud, inspection.scan, metres, role)
         try:
             link = _frame_of(inspection, "local" if inspection.seems_local else declared, local)
-            if link.file_crs is None and link.scanner.unit is None:
-                with self.stopping("unit", role) if inspection.is_local else suppress(InputError):
-                    check_unit(cloud.name, role, inspection.scan.sample, cloud.count)
             sample = link.to_work(inspection.scan.sample)
         except (CrsError, InputError):
-            return  # reported where the common frame is settled, or in the guess at a missing CRS
-        if self.refusals and self.findings[-1].code == "unit":
-            return
+            return  # reported where the common frame is settled
+        if link.file_crs is None and link.scanner.unit is None:
+            try:
+                check_unit(cloud.name, role, inspection.scan.sample, cloud.count)
+            except InputError as error:
+                if inspection.is_local:
+                    self.refuse(error, "unit", role)
+                return  # else it stands in the guess at a missing CRS
         try:
             dense = coverage_of(sample, points=cloud.count)
         except RegistrationError as error:
@@ -240,7 +255,10 @@ class _Check:
             sample, low, high, float(link.origin[2]), dense.per_m2, dense.occupied_m2
         )
         found += points.plan_findings(inspection.measured, role)
-        found += points.storage_findings(link, inspection.scan, role)
+        if role == "source":
+            with self.stopping("scale", role):
+                points.check_scale(link, inspection.scan, self.scale)
+                found += points.storage_findings(link, inspection.scan, role, self.scale)
         if inspection.is_local or inspection.seems_local:
             found += upright.upright_findings(sample, role)
         upright_as_it_is = not any(one.role == role and one.code == "lies-on-its-side" for one in found)
@@ -283,6 +301,7 @@ class _Check:
             self.relation = pair.by_area(source, target)
         if self.relation.name != "overlapping":
             self.findings += pair.swapped_findings(source, target)
+        self.findings += pair.lookalike_findings(source, target)
         self.findings += pair.result_findings(source, target)
         self.findings += pair.exchanged_findings(source, target)
         self.findings += pair.same_points_findings(source, target)
@@ -326,11 +345,10 @@ class _Check:
             link.to_work(scan.sample) for link, scan in ((to_source, source.scan), (to_target, target.scan))
         ]
         if frame.crs is None or source.is_local or target.is_local:
-            local = " and the ".join(
-                inspection.role for inspection in (source, target) if inspection.is_local
-            )
+            local = [inspection.role for inspection in (source, target) if inspection.is_local]
+            which = "both have" if len(local) > 1 else f"the {local[0]} has"
             self.relation = pair.Relation(
-                "unknown", why=f"the {local} has local coordinates; registering finds its place"
+                "unknown", why=f"{which} local coordinates; registering finds the place of the source"
             )
             return
         overlap: Overlap | None
@@ -352,6 +370,9 @@ class _Check:
             for inspection in self.inspections.values()
             if inspection.measured is not None
         ]
+        # one that lies on its side is levelled first, or turned by an option
+        on_side = {found.role for found in self.findings if found.code == "lies-on-its-side"}
+        sides = [(one, measured) for one, measured in sides if one.role not in on_side]
         if self.refusals or not sides:
             return
         clouds = [
@@ -374,5 +395,6 @@ class _Check:
             {role: describe(inspection) for role, inspection in in_order},
             self.relation,
             by_severity(self.findings),
+            dict(sorted(self.files.items())),
             self.refusals[0].exit_code if self.refusals else 0,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING
@@ -48,19 +49,23 @@ def print_report(console: Console, report: CheckReport) -> None:
     from rich.table import Table
     from rich.text import Text
 
+    several = len(report.files) > 1
     if report.clouds:
         table = Table(box=None, pad_edge=True, padding=(0, 1))
         table.add_column("")
-        for role in report.clouds:
-            table.add_column(role if len(report.clouds) > 1 else "", overflow="fold")
-        columns = [_cells(facts) for facts in report.clouds.values()]
-        for label in columns[0]:
+        for role in report.files:
+            table.add_column(role if several else "", overflow="fold")
+        columns = [
+            _cells(report.clouds[role]) if role in report.clouds else defaultdict(lambda: _UNKNOWN, file=file)
+            for role, file in report.files.items()
+        ]
+        for label in _cells(next(iter(report.clouds.values()))):
             table.add_row(label, *(Text(column[label]) for column in columns))
         console.print(table)
     if report.relation is not None:
         console.print(Text(f"  {relation_text(report.relation)}"), soft_wrap=True)
     for finding in report.findings:
-        where = "" if finding.role == "both" or len(report.clouds) < 2 else f"{finding.role}: "
+        where = "" if finding.role == "both" or not several else f"{finding.role}: "
         line = Text(f"{finding.severity:>7} ", _COLOUR[finding.severity])
         console.print(line.append(f"{where}{finding.what}", "default"), soft_wrap=True)
         if finding.fix:
@@ -76,7 +81,8 @@ def relation_text(relation: Relation) -> str:
     if relation.name == "unknown":
         return f"whether they overlap is not known: {relation.why}"
     if relation.name == "apart":
-        return f"by their CRSs they are {distance_text(relation.distance_m or 0.0)} apart"
+        middles = " from middle to middle" if relation.by_middles else ""
+        return f"by their CRSs they are {distance_text(relation.distance_m or 0.0)} apart{middles}"
     return (
         f"by their CRSs they overlap: {relation.overlap_m2:,.0f} m2, "
         f"{relation.source_share:.0%} of the source and {relation.target_share:.0%} of the target"

@@ -27,6 +27,8 @@ def run(options: ApplyVerb) -> None:
             options.cloud,
             options.out,
             inverse=options.inverse,
+            text=options.text,
+            scale=options.scale,
             overwrite=options.overwrite,
             progress=progress,
             say=lambda text: typer.echo(one_line(f"mtpcr-geo: warning: {text}"), err=True),

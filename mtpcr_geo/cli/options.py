@@ -11,18 +11,14 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from mtpcr_geo.pipeline.file_options import CloudText, Scale, SourceText, TargetText
 from mtpcr_geo.pipeline.options import (
-    INPUTS,
-    OUTPUT,
-    PRIOR,
-    RUN,
     Local,
     Models,
     Near,
     NearCrs,
     Overwrite,
     RegisterOptions,
-    Shown,
     SourceAxes,
     SourceCrs,
     SourceUnit,
@@ -32,6 +28,7 @@ from mtpcr_geo.pipeline.options import (
     Vertical,
     Within,
 )
+from mtpcr_geo.pipeline.shown import INPUTS, OUTPUT, PRIOR, RUN, Shown
 
 FORMATS = (
     "LAS, LAZ, COPC, PLY, PCD, XYZ, CSV, TXT, PTS, PTX, E57 or NPY; several files as a folder, a pattern in "
@@ -135,9 +132,14 @@ class ApplyVerb(VerbOptions):
     ]
     out: Annotated[
         Path,
-        Field(description="file to write: .las or .laz; for several files a folder"),
+        Field(
+            description="file to write, its ending the format: .laz, .las, .copc.laz, .ply, .pcd, .xyz, "
+            ".csv, .npy or .e57; for several files a folder"
+        ),
         Shown(OUTPUT, argument=True),
     ]
+    text: CloudText = None
+    scale: Scale = None
     inverse: Annotated[
         bool, Field(description="move from the target's frame to the source's instead"), Shown(RUN)
     ] = False
@@ -160,6 +162,9 @@ class CheckVerb(VerbOptions):
     target_unit: TargetUnit = None
     source_axes: SourceAxes = "z-up"
     target_axes: TargetAxes = "z-up"
+    source_text: SourceText = None
+    target_text: TargetText = None
+    scale: Scale = None
     local: Local = False
     vertical: Vertical = "refuse"
     near: Near = None

@@ -18,7 +18,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.pipeline.options import GROUPS, Shown, description_of, first_problem, shown_of
+from mtpcr_geo.pipeline.options import first_problem
+from mtpcr_geo.pipeline.shown import GROUPS, Shown, description_of, shown_of
 
 Model = TypeVar("Model", bound=BaseModel)
 

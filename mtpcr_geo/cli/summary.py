@@ -34,6 +34,7 @@ _SHOWN = (
 )
 _OPEN_WITH = {
     "registered": "the moved cloud",
+    "registered_also": "the moved cloud, for other programs",
     "report": "the report, in any browser",
     "recording": "the recording, with: rerun",
     "tie_points": "tie points and footprints, in QGIS",
@@ -117,14 +118,16 @@ def _withheld_lines(result: Registration, force_with: str) -> list[str]:
 
 
 def _left_out_lines(result: Registration) -> list[str]:
-    """Say which points could not be stored."""
-    from mtpcr_geo.export.apply import left_out_text
+    """Say which points and dimensions could not be stored."""
+    from mtpcr_geo.io.write_any import LeftOut
 
-    return [
-        left_out_text(int(record.metadata["left_out"]), Path(str(record.metadata["filename"])).name)
-        for record in result.report
-        if record.metadata.get("left_out")
-    ]
+    said = []
+    for record in result.report:
+        kept = record.metadata
+        if kept.get("left_out") or kept.get("dimensions_left_out"):
+            missing = LeftOut(int(kept.get("left_out", 0)), tuple(kept.get("dimensions_left_out", ())))
+            said += missing.sentences(Path(str(kept["filename"])).name)
+    return said
 
 
 def _stdout() -> Console:

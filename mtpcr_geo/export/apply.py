@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mtpcr_geo.core.errors import CrsError, InputError, OutputError
+from mtpcr_geo.core.errors import CrsError, InputError
 from mtpcr_geo.crs.facts import same_place
 from mtpcr_geo.export.transform import read_transform
 from mtpcr_geo.io.formats import open_any
@@ -16,7 +16,7 @@ from mtpcr_geo.io.many import ManyFiles, output_names
 from mtpcr_geo.io.memory import cloud_of, coordinates, is_array
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.io.views import Moved
-from mtpcr_geo.io.write import write_cloud
+from mtpcr_geo.io.write_any import ENDINGS, check_ending, write_any
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.arrays import Floats
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from mtpcr_geo.crs.chain import TransformChain
     from mtpcr_geo.io.memory import CloudLike
 
-_ENDINGS = (".las", ".laz")
 # a cloud that states no CRS may lie this many extents of the registered one away from it
 _FAR = 10.0
 
@@ -38,10 +37,12 @@ def apply_transform(
     overwrite: bool = False,
     progress: Progress | None = None,
     say: Callable[[str], object] | None = None,
+    text: str | None = None,
+    scale: float | None = None,
 ) -> Path:
-    """Stream a cloud through a transform into a new LAS, LAZ or COPC file.
+    """Stream a cloud through a transform into a new file of any format that is written.
 
-    The output's storage step is finer than the input's, so that moving there and back returns every point.
+    The storage step of LAS is finer than the input's, so that moving there and back returns every point.
 
     Args:
         transform_path: a ``transform.json``.
@@ -51,7 +52,9 @@ def apply_transform(
         inverse: go from target to source.
         overwrite: whether `out_path` may be replaced.
         progress: where to report the points written.
-        say: called with a sentence where points were left out.
+        say: called with a sentence where points or dimensions were left out.
+        text: layout of a cloud that is text, see `mtpcr_geo.io.formats.text_layout.TextLayout.read`.
+        scale: storage step of a LAS file, in units of its CRS.
 
     Returns:
         The file written.
@@ -63,24 +66,19 @@ def apply_transform(
 
     """
     chain = read_transform(transform_path)
-    cloud = open_any(in_path)
+    cloud = open_any(in_path, text=text)
     out_path = Path(out_path)
     for read in (cloud.path, Path(in_path), Path(transform_path)):
         if out_path.exists() and read.is_file() and out_path.samefile(read):
             raise InputError(f"{out_path} is input and output at once; write to another file")
     moved = moved_by(chain, cloud, inverse=inverse)
-    left_out = write_moved(
-        out_path, moved, overwrite=overwrite, reads=(in_path, transform_path), progress=progress
+    said = write_moved(
+        out_path, moved, overwrite=overwrite, reads=(in_path, transform_path), progress=progress, scale=scale
     )
-    if left_out and say is not None:
-        say(left_out_text(left_out, out_path.name))
+    if say is not None:
+        for sentence in said:
+            say(sentence)
     return out_path
-
-
-def left_out_text(count: int, name: str) -> str:
-    """Return in a sentence that points were left out of a file."""
-    points = "1 point is" if count == 1 else f"{count:,} points are"
-    return f"{points} left out of {name}: too far from all others to be stored with them"
 
 
 def move(chain: TransformChain, points: CloudLike, *, inverse: bool = False) -> Floats | Cloud:
@@ -174,8 +172,9 @@ def write_moved(
     overwrite: bool = False,
     reads: Iterable[str | Path] = (),
     progress: Progress | None = None,
-) -> int:
-    """Stream a moved cloud into a new LAS, LAZ or COPC file, with digits fine enough to move it back.
+    scale: float | None = None,
+) -> list[str]:
+    """Stream a moved cloud into a new file, LAS with digits fine enough to move it back.
 
     Args:
         out_path: where to write; the suffix is the format. For a cloud of many files a folder.
@@ -183,9 +182,10 @@ def write_moved(
         overwrite: whether `out_path` may be replaced.
         reads: files that are read, and never replaced.
         progress: where to report the points written.
+        scale: storage step of a LAS file, in units of its CRS.
 
     Returns:
-        The number of points left out, since they lie too far from all others to be stored with them.
+        What was left out, a sentence for each file and kind.
 
     Raises:
         OutputError: if the output cannot be written, or exists, or its ending names no format.
@@ -196,18 +196,17 @@ def write_moved(
         clouds = moved.base.parts
         names = output_names([Path(part.name) for part in clouds])
         parts = [(out_path / name, part) for name, part in zip(names, clouds, strict=True)]
-        if out_path.is_file():
-            raise InputError(f"{out_path} is a file, and {len(parts)} files are moved; name a folder")
-    elif out_path.suffix.lower() not in _ENDINGS:
-        raise OutputError(
-            f"{out_path} ends in none of {', '.join(_ENDINGS)} and .copc.laz, which are the formats written; "
-            "name such a file"
-        )
+        if out_path.is_file() or out_path.suffix.lower() in ENDINGS:
+            files = "1 file is" if len(parts) == 1 else f"{len(parts)} files are"
+            raise InputError(f"{out_path} is a file by its name, and {files} moved to a folder; name one")
+    else:
+        check_ending(out_path)
     with OutputSet(overwrite) as outputs:
         outputs.keep([*(Path(file) for file in reads), *paths_of(moved.base)])
-        left_out = sum(
-            write_cloud(outputs.path(final), part, moved.move, moved.crs, progress=progress, returning=True)
-            for final, part in parts
-        )
+        said = []
+        for final, part in parts:
+            path = outputs.path(final)
+            left_out = write_any(path, part, moved.move, moved.crs, scale, progress, returning=scale is None)
+            said += left_out.sentences(final.name)
         outputs.commit()
-    return left_out
+    return said

@@ -169,8 +169,8 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
   out
 - ``mtpcr.level <role>.stray_points``: points that lie far from all others: kept in what is written, left
   out of everything else
-- ``mtpcr.level <role>.header_remarks``: what the points say otherwise than the header of the file, a
-  sentence each; only where there is something
+- ``mtpcr.level <role>.header_remarks``: what the points say otherwise than the header of the file, and
+  whether they are coarse single-precision numbers, a sentence each; only where there is something
 - ``mtpcr.level <role>.no_return_points``: points that mark beams without a return, all on exactly one place:
   kept in what is written, left out of everything else
 - ``mtpcr.level <role>.sampled``: points kept to work on

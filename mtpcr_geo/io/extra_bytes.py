@@ -70,23 +70,33 @@ class ExtraBytes:
 
     def add_to(self, point_format: laspy.PointFormat) -> None:
         """Add the dimensions to a point format."""
-        if self.descriptors:
+        for raw in self.descriptors:
+            if raw[2] == 0:
+                # its options are its width, and laspy would read them as the bits of other types
+                name, text = (text_of(raw[part]) for part in (_NAME, _DESCRIPTION))
+                point_format.dimensions.append(_bytes(name, raw[3], text))
+                continue
             known = ExtraBytesVlr()
-            known.parse_record_data(self.data)
+            known.parse_record_data(raw)
             for dimension in known.type_of_extra_dims():
                 point_format.add_extra_dimension(dimension)
         if self.rest:
             taken = {dimension.name.lower() for dimension in point_format.dimensions}
             point_format.dimensions.append(
-                laspy.point.dims.DimensionInfo(
-                    name=_unique(_REST, taken),
-                    kind=laspy.point.dims.DimensionKind.UnsignedInteger,
-                    num_bits=8 * self.rest,
-                    num_elements=self.rest,
-                    is_standard=False,
-                    description="bytes without a descriptor",
-                )
+                _bytes(_unique(_REST, taken), self.rest, "bytes without a descriptor")
             )
+
+
+def _bytes(name: str, width: int, description: str) -> laspy.point.dims.DimensionInfo:
+    """Return a dimension of so many bytes that are no number."""
+    return laspy.point.dims.DimensionInfo(
+        name=name,
+        kind=laspy.point.dims.DimensionKind.UnsignedInteger,
+        num_bits=8 * width,
+        num_elements=width,
+        is_standard=False,
+        description=description,
+    )
 
 
 def _descriptors(records: Sequence[Record]) -> Iterator[bytes]:

@@ -25,6 +25,8 @@ _KNOWN.update(r="Red", g="Green", b="Blue", i="Intensity", time="GpsTime", label
 _KNOWN.update(scalar_intensity="Intensity", scalar_classification="Classification")
 _KNOWN.update(diffuse_red="Red", diffuse_green="Green", diffuse_blue="Blue")
 _KNOWN["class"] = "Classification"
+COARSE_SINGLE = 0.005
+"""Steps of single-precision coordinates, in metres (or units like them), from which on they are remarked."""
 _RANGES = {"Intensity": 65535, "Red": 65535, "Green": 65535, "Blue": 65535, "Infrared": 65535}
 _FLOATS = {"GpsTime"}
 _TAKEN = {dimension.name.lower() for dimension in laspy.PointFormat(8).dimensions}
@@ -144,3 +146,38 @@ def reported(path: Path) -> Iterator[None]:
     except (ValueError, KeyError, IndexError, TypeError, RuntimeError, EOFError, UnicodeError) as error:
         detail = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{path} is truncated or damaged ({detail}); copy or export it again") from error
+
+
+def single_precision_step(xyz: Floats) -> Floats | None:
+    """Return the steps between single-precision numbers as large as some coordinates; None if they are finer.
+
+    Args:
+        xyz: (n, 3) coordinates.
+
+    Returns:
+        (3,) the largest step on each axis, in units of the coordinates, where all of them are such numbers.
+
+    """
+    if not len(xyz) or not np.isfinite(xyz).all() or np.abs(xyz).max() > np.finfo(np.float32).max:
+        return None
+    single = xyz.astype(np.float32)
+    if not np.array_equal(single, xyz):
+        return None
+    return np.asarray(np.spacing(np.abs(single).max(axis=0)), np.float64)
+
+
+def precision_remark(cloud: Cloud, xyz: Floats) -> str | None:
+    """Return in a sentence that a cloud's coordinates are coarse single-precision numbers; None if not.
+
+    Args:
+        cloud: it; LAS has whole numbers, whatever they were made of.
+        xyz: (n, 3) a sample of it, in its units.
+
+    """
+    step = single_precision_step(xyz) if isinstance(cloud, FileCloud) else None
+    if step is None or float(step.max()) < COARSE_SINGLE:
+        return None
+    return (
+        f"its coordinates are single-precision numbers, in steps of {step.max():.2g} where they are as large "
+        f"as {np.abs(xyz).max():,.0f}: what is finer was lost when it was written"
+    )

@@ -6,7 +6,9 @@ import glob
 import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 import numpy as np
 
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 LIST_MARK = "@"
+_MAYBE_NOTES = (".txt", ".csv", ".asc")
 
 
 class ManyFiles(FileCloud):
@@ -33,8 +36,10 @@ class ManyFiles(FileCloud):
     def __init__(self, path: Path, crs: CRS | None, parts: Sequence[Cloud]) -> None:
         super().__init__(path, crs, f"{len(parts)} files", sum(part.count for part in parts))
         self.parts = tuple(parts)
-        self.minimum = np.min([part.minimum for part in parts], axis=0)
-        self.maximum = np.max([part.maximum for part in parts], axis=0)
+        # a tile without points has bounds that say nothing
+        some = [part for part in parts if part.count] or list(parts)
+        self.minimum = np.min([part.minimum for part in some], axis=0)
+        self.maximum = np.max([part.maximum for part in some], axis=0)
 
     def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
         """Yield (n, 3) float64 coordinates; but for the last chunk n = size, wherever a file ends."""
@@ -106,17 +111,25 @@ def files_of(path: str | Path, is_cloud: Callable[[Path], bool]) -> list[Path]:
     if text.startswith(LIST_MARK):
         files = _listed(Path(text[len(LIST_MARK) :]))
     elif found.is_dir():
-        files = sorted(one for one in found.iterdir() if one.is_file() and is_cloud(one))
+        files = _clouds_of(sorted(one for one in found.iterdir() if one.is_file() and is_cloud(one)))
     elif found.is_file():
         files = _of_vpc(found)
     else:
         files = sorted(Path(one) for one in glob.glob(text, recursive=True) if Path(one).is_file())
+        # "*" takes whatever lies there
+        files = _clouds_of([one for one in files if is_cloud(one)] or files)
     if not files:
         raise InputError(f"{path} names no cloud; check the path, or the endings of the files")
     missing = next((one for one in files if not one.is_file()), None)
     if missing is not None:
         raise InputError(f"{path} names {missing}, which is not there; check the list")
     return files
+
+
+def _clouds_of(files: list[Path]) -> list[Path]:
+    """Leave out what may be a note or a table, where other files are clouds for certain."""
+    certain = [one for one in files if one.suffix.lower() not in _MAYBE_NOTES]
+    return certain or files
 
 
 def join(path: str | Path, parts: Sequence[Cloud], crs: CRS | None) -> ManyFiles:
@@ -128,20 +141,24 @@ def join(path: str | Path, parts: Sequence[Cloud], crs: CRS | None) -> ManyFiles
         crs: coordinate reference system to take instead of what the files state.
 
     Raises:
-        CrsError: if they state different ones.
+        CrsError: if they state different ones. Where some state none, the whole states none either.
 
     """
-    if crs is None:
-        crs = parts[0].crs
-        for part in parts[1:]:
-            same = part.crs is crs or (part.crs is not None and crs is not None and same_place(part.crs, crs))
-            if not same:
-                names = ["none" if one is None else one.name for one in (crs, part.crs)]
-                raise CrsError(
-                    f"{parts[0].name} is in {names[0]} and {part.name} in {names[1]}; bring them to one "
-                    "system first"
-                )
-    return ManyFiles(Path(path), crs, parts)
+    if crs is not None:
+        return ManyFiles(Path(path), crs, parts)
+    stated = [part for part in parts if part.crs is not None]
+    for part in stated[1:]:
+        first = stated[0]
+        if first.crs is not None and part.crs is not None and not same_place(part.crs, first.crs):
+            raise CrsError(
+                f"{first.name} is in {first.crs.name} and {part.name} in {part.crs.name}; bring them to one "
+                "system first"
+            )
+    whole = ManyFiles(Path(path), stated[0].crs if len(stated) == len(parts) else None, parts)
+    if 0 < len(stated) < len(parts):
+        silent = next(part for part in parts if part.crs is None)
+        whole.crs_problem = f"{stated[0].name} states one, and {silent.name} states none"
+    return whole
 
 
 def output_names(files: Sequence[Path]) -> list[str]:
@@ -164,13 +181,14 @@ def _listed(path: Path) -> list[Path]:
         raise InputError(
             f"cannot read the list {path} ({error}); give a text file with a path a line"
         ) from error
-    return [path.parent / line.strip() for line in lines if line.strip() and not line.startswith("#")]
+    names = [line.strip().strip("\"'") for line in lines]
+    return [path.parent / name for name in names if name and not name.startswith("#")]
 
 
 def _of_vpc(path: Path) -> list[Path]:
     try:
         features = json.loads(path.read_text(encoding="utf-8"))["features"]
-        places = [next(iter(one["assets"].values()))["href"] for one in features]
+        places = [_local(_data_of(one["assets"])["href"]) for one in features]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as error:
         raise InputError(
             f"{path} is no virtual point cloud ({type(error).__name__}: {error}); make it anew"
@@ -179,3 +197,19 @@ def _of_vpc(path: Path) -> list[Path]:
     if remote is not None:
         raise InputError(f"{path} names {remote}; only files on this machine are read")
     return [path.parent / place for place in places]
+
+
+def _data_of(assets: dict[str, Any]) -> dict[str, Any]:
+    """Return the asset of a STAC item that is its data: by its name or role, else the first."""
+    if "data" in assets:
+        return dict(assets["data"])
+    by_role = (one for one in assets.values() if "data" in one.get("roles", ()))
+    return dict(next(by_role, next(iter(assets.values()))))
+
+
+def _local(place: str) -> str:
+    """Return a path of this machine for a ``file://`` address of it; all else as it is."""
+    parts = urlsplit(place)
+    if parts.scheme == "file" and parts.netloc in ("", "localhost"):
+        return url2pathname(parts.path)
+    return place

@@ -61,18 +61,23 @@ def settled(cloud: Cloud, move: Move | None, scales: Floats, coarsest: Floats | 
     some = np.concatenate(looked)
     middle, half = np.rint((low + high) / 2), (high - low) / 2 + 1.0
     grown = scales.copy()
-    while coarsest is not None and (half / grown > MOST_STEPS).any() and (grown < coarsest).any():
-        grown = np.minimum(grown * 10, np.maximum(coarsest, scales))
+    while coarsest is not None and ((half / grown > MOST_STEPS) & (grown < coarsest)).any():
+        # each axis by itself: a wide plan shall not cost the heights their digits
+        coarser = np.minimum(grown * 10, np.maximum(coarsest, scales))
+        grown = np.where(half / grown > MOST_STEPS, coarser, grown)
     if (half / grown <= MOST_STEPS).all():
         return Storage(grown, middle)
+    # beams without a return lie at one place, however many they are
+    places = np.unique(some, axis=0)
     # the finer scale again: a few points far away shall not cost the others their digits
     for wanted in (scales, grown):
-        offsets = np.rint(np.median(some, axis=0))
-        misfit = (np.abs(some - offsets) / wanted > MOST_STEPS).any(axis=1)
+        offsets = np.rint(np.median(places, axis=0))
+        misfit = (np.abs(places - offsets) / wanted > MOST_STEPS).any(axis=1)
         if misfit.mean() <= FEW_SHARE:
             return Storage(wanted, offsets)
-    distance = float(np.abs(some - offsets).max())
+    distance = float(np.abs(places - offsets).max())
     raise OutputError(
         f"{misfit.mean():.0%} of the points, up to {distance:.0f} from the others, do not fit a LAS file at "
-        f"scale {grown.min():g}; give a coarser scale (scale_x ... of writers.las), or take them apart"
+        f"scale {grown.min():g}; give a coarser one (--scale; scale_x ... of writers.las in a pipeline), or "
+        "take them apart"
     )

@@ -16,9 +16,8 @@ WKT_RECORD = 2112
 GEOKEYS, GEODOUBLES, GEOASCII = 34735, 34736, 34737
 EXTRA_BYTES = ("LASF_Spec", 4)
 _CRS_RECORDS = {2111, WKT_RECORD, GEOKEYS, GEODOUBLES, GEOASCII}
-# What belongs to how the file was laid out, not to the points: compression, octree, superseded records.
+# What belongs to how the file was laid out, not to the points: compression, octree.
 _LAYOUT_USERS = {"laszip encoded", "copc", "entwine"}
-_SUPERSEDED = ("LASF_Spec", 7)
 _WAVEFORM_PACKETS = ("LASF_Spec", 65535)
 
 
@@ -54,7 +53,7 @@ class Record:
     def is_kept(self) -> bool:
         """Return whether the record still holds for the same points in another file and place."""
         key = (self.user_id, self.record_id)
-        layout = self.user_id in _LAYOUT_USERS or key in (_SUPERSEDED, _WAVEFORM_PACKETS, EXTRA_BYTES)
+        layout = self.user_id in _LAYOUT_USERS or key in (_WAVEFORM_PACKETS, EXTRA_BYTES)
         return not (self.states_crs or layout)
 
 

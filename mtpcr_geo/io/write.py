@@ -145,8 +145,10 @@ def returning_scales(cloud: Cloud, crs: CRS | None) -> Floats:
         scales = np.clip(scales, FINEST_STEP / 10, STEP)
     extent = cloud.maximum - cloud.minimum
     if cloud.crs is None or not cloud.crs.is_geographic:
-        while np.isfinite(extent).all() and scales.min() < STEP and extent.max() / scales.min() > MOST_STEPS:
-            scales = np.minimum(scales * 10, STEP)
+        # from the middle to the sides; what a turn or a tilt adds is for `settled`
+        half = 0.5 * np.array([*(extent[:2].max(),) * 2, extent[2]])
+        while np.isfinite(half).all() and ((scales < STEP) & (half / scales > MOST_STEPS)).any():
+            scales = np.where(half / scales > MOST_STEPS, np.minimum(scales * 10, STEP), scales)
     if crs is not None and crs.is_geographic:
         scales[:2] = np.minimum(scales[:2] / _METRES_A_DEGREE, DEGREE_STEP)
     return scales

@@ -20,6 +20,8 @@ FLAT_M = 0.1
 """Height above the surroundings that counts as noise; as in `mtpcr_geo.match.search`."""
 FLAT_SHARE = 0.99
 HOLES_WITHIN, MOSTLY_HOLES = 3, 0.1
+SPREAD = 1.5
+"""Times that a cloud is wider than a square of its occupied cells, from which on it is mostly empty."""
 COARSER = 1.5
 """Times that a cell exceeds what the density bears, from which on a finer one is worth trying."""
 
@@ -53,7 +55,9 @@ def what_is_missing(source: Bev, target: Bev) -> str | None:
     return cells_short(cell, float(np.sqrt(area[role])), role, per_m2)
 
 
-def cells_short(cell_m: float, extent_m: float, role: str, per_m2: float) -> str | None:
+def cells_short(
+    cell_m: float, extent_m: float, role: str, per_m2: float, spread_m: float = 0.0
+) -> str | None:
     """Say why a cloud is only few cells across, and what to do; None where they are enough.
 
     Args:
@@ -61,12 +65,18 @@ def cells_short(cell_m: float, extent_m: float, role: str, per_m2: float) -> str
         extent_m: edge of a square of the smaller cloud's occupied area, metres.
         role: which cloud that is.
         per_m2: points per occupied square metre of the sparser cloud.
+        spread_m: edge of a square of the ground over which that cloud is spread, holes included, metres.
 
     """
     across = extent_m / cell_m
     if across >= FEW_CELLS_ACROSS:
         return None
     size = f"the {role} is about {extent_m:.0f} m across, {across:.0f} cells of {cell_m:g} m"
+    if spread_m > SPREAD * extent_m:
+        size = (
+            f"the {role} is spread over {spread_m:.0f} x {spread_m:.0f} m, and holds points in no more cells "
+            f"of {cell_m:g} m than a square of {across:.0f} x {across:.0f} has"
+        )
     borne = max(float(np.sqrt(POINTS_PER_CELL / max(per_m2, 1e-9))), FINEST_AUTO_CELL_M)
     if cell_m > COARSER * borne:
         return f"{size}, and the points bear cells of {borne:.2g} m: give a finer cell (option cell)"

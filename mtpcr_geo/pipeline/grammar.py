@@ -17,6 +17,8 @@ from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.suggestions import meant
 
 _TAG = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
+ANY_READER = "mtpcr.read"
+CLOUD_WRITERS = ("mtpcr.write", "mtpcr.write_each")
 _GLOB = re.compile(r"[*?\[]")
 _OWN_KEYS = frozenset({"type", "tag", "inputs"})
 
@@ -69,7 +71,7 @@ class Element:
     @property
     def is_reader(self) -> bool:
         """Return whether it starts a chain."""
-        return self.type.startswith("readers.")
+        return self.type.startswith("readers.") or self.type == ANY_READER
 
     @property
     def is_writer(self) -> bool:
@@ -329,7 +331,9 @@ def file_of(options: Mapping[str, Any]) -> str | None:
 def _readers(element: Element, taken: set[str]) -> list[StageSpec]:
     filename = file_of(element.options)
     files: list[str] = []
-    if filename and _GLOB.search(filename) and not Path(filename).exists():
+    # the reader of any format takes a pattern itself, as one cloud
+    pattern = element.type != ANY_READER and filename and _GLOB.search(filename)
+    if filename and pattern and not Path(filename).exists():
         files = sorted(glob.glob(filename))
         if not files:
             raise OptionError(f"{element.label}: no file fits the pattern {filename!r}")

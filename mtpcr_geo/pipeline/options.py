@@ -10,46 +10,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
-from pydantic.fields import FieldInfo
 
 from mtpcr_geo.core.suggestions import meant
 from mtpcr_geo.core.units import UNITS, Axes, Unit
-
-INPUTS = "Inputs and CRS"
-RASTERS = "Levelling and rasters"
-MATCHING = "Matching"
-PRIOR = "Prior"
-RESULT = "Result"
-RUN = "Run"
-OUTPUT = "Output"
-GROUPS = (INPUTS, RASTERS, MATCHING, PRIOR, RESULT, RUN, OUTPUT)
-"""Groups of the command's help, in order."""
-
-
-@dataclass(frozen=True)
-class Shown:
-    """How the command shows an option.
-
-    Attributes:
-        group: heading under which it stands in the help.
-        names: what is written on the command line; ``--name-of-the-field`` if empty, and for a switch that
-            is on by default ``--no-name-of-the-field``, so that its description follows "do not".
-        argument: it is given by its place, without a name.
-        metavar: what stands for its value, where its type does not say enough.
-
-    """
-
-    group: str
-    names: tuple[str, ...] = ()
-    argument: bool = False
-    metavar: str = ""
-
+from mtpcr_geo.pipeline.file_options import Also, Scale, SourceText, TargetText
+from mtpcr_geo.pipeline.shown import INPUTS, MATCHING, OUTPUT, PRIOR, RASTERS, RESULT, Shown, description_of
 
 SourceCrs = Annotated[
     str | None,
@@ -332,16 +302,6 @@ Force = Annotated[
 Overwrite = Annotated[bool, Field(description="replace files that are there already"), Shown(OUTPUT)]
 
 
-def description_of(kind: Any) -> str:
-    """Return the description of an option's `Annotated` type."""
-    return next(str(part.description) for part in get_args(kind)[1:] if isinstance(part, FieldInfo))
-
-
-def shown_of(kind: Any) -> Shown:
-    """Return how the command shows an option, from its `Annotated` type."""
-    return next(part for part in get_args(kind)[1:] if isinstance(part, Shown))
-
-
 class MethodOptions(PriorOptions):
     """Options of the method, from levelling to verdict."""
 
@@ -392,6 +352,10 @@ class MethodOptions(PriorOptions):
 class RegisterOptions(MethodOptions):
     """Options of a registration: of the method, and of what it writes."""
 
+    source_text: SourceText = None
+    target_text: TargetText = None
+    scale: Scale = None
+    also: Also = None
     recording: Annotated[
         bool, Field(description="write a recording of the run for the rerun viewer"), Shown(OUTPUT)
     ] = True

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import MissingPartError, OptionError
 from mtpcr_geo.pipeline import safety
-from mtpcr_geo.pipeline.grammar import StageSpec, file_of
+from mtpcr_geo.pipeline.grammar import ANY_READER, CLOUD_WRITERS, StageSpec, file_of
 from mtpcr_geo.pipeline.pdal import bindings
 from mtpcr_geo.pipeline.pdal.switches import Access
 from mtpcr_geo.pipeline.registry import make_options, stage_types, unknown_type
@@ -170,13 +170,15 @@ def _check_kinds(specs: Sequence[StageSpec]) -> None:
 
 
 def _kind_made(spec: StageSpec) -> Kind:
-    if spec.type == "mtpcr.apply" or not spec.type.startswith("mtpcr."):
+    of_clouds = ("mtpcr.apply", ANY_READER, *CLOUD_WRITERS)
+    if spec.type in of_clouds or not spec.type.startswith("mtpcr."):
         return "cloud"
     return "pair"
 
 
 def _wanted(spec: StageSpec) -> Kind:
-    if spec.type in ("mtpcr.level", "mtpcr.register") or not spec.type.startswith("mtpcr."):
+    of_clouds = ("mtpcr.level", "mtpcr.register", *CLOUD_WRITERS)
+    if spec.type in of_clouds or not spec.type.startswith("mtpcr."):
         return "cloud"
     return "pair"
 

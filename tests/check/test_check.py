@@ -369,7 +369,7 @@ def test_how_they_lie_to_each_other(pairs):
     assert "not known" in relation("bare").why
     assert relation("source", source_crs="local").name == "unknown"
     assert "source has local" in relation("source", source_crs="local").why
-    assert "source and the target" in relation("source", local=True).why
+    assert "both have local" in relation("source", local=True).why
 
 
 def test_offset_says_who_is_higher_and_by_how_much(pairs):

@@ -12,8 +12,9 @@ from mtpcr_geo.cli import app as cli
 from mtpcr_geo.cli import options as verbs
 from mtpcr_geo.cli.parameters import help_of, shown_fields, spelling
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.pipeline.options import GROUPS, RegisterOptions
+from mtpcr_geo.pipeline.options import RegisterOptions
 from mtpcr_geo.pipeline.registry import stage_types
+from mtpcr_geo.pipeline.shown import GROUPS
 
 MODELS: dict[str, type[BaseModel]] = {
     "register": verbs.RegisterVerb,
@@ -152,6 +153,7 @@ def test_every_option_reaches_register(monkeypatch):
         "vertical": "estimate", "out_crs": "EPSG:25833", "prior": "none", "near": (4.5, -52.0),
         "near_crs": "EPSG:4326", "within": 40.0, "yaw": -30.0, "yaw_tolerance": 8.0,
         "motion": "yaw", "profile": "paper", "matcher": "orb", "models": "folder",
+        "source_text": "x y z separator=; skip=2", "target_text": "x - y z", "scale": 0.01, "also": "ply",
         "res": False, "focus": False, "enhance": False, "seed": 4, "recording": False, "force": True,
         "overwrite": True,
     }  # fmt: skip

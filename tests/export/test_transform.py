@@ -331,7 +331,7 @@ def test_apply_writes_no_other_format_and_never_over_its_own_transform(tmp_path)
     for name, words in (
         ("t.json", "input and output"),
         ("link.laz", "input and output"),
-        ("out.xyz", "ends in"),
+        ("out.pts", "ends in"),
     ):
         with pytest.raises((InputError, OutputError), match=words):
             apply_transform(tmp_path / "t.json", tmp_path / "source.laz", tmp_path / name, overwrite=True)

@@ -19,10 +19,12 @@ from mtpcr_geo.cli.app import app
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import CrsError, InputError
+from mtpcr_geo.export.apply import write_moved
 from mtpcr_geo.io.formats import open_any
 from mtpcr_geo.io.las import open_cloud
 from mtpcr_geo.io.many import ManyFiles, output_names
 from mtpcr_geo.io.sample import scan
+from mtpcr_geo.io.views import Moved
 from mtpcr_geo.io.write import write_cloud
 
 UTM = CRS.from_epsg(25833)
@@ -148,10 +150,68 @@ def test_different_systems_are_refused(clouds, tmp_path):
     save(tmp_path / "b.laz", source, CRS.from_epsg(25832))
     with pytest.raises(CrsError, match="bring them to one system"):
         open_any(tmp_path)
+    # of some that state none the system is not known, until an option names it
     save(tmp_path / "b.laz", source, None)
-    with pytest.raises(CrsError, match="bring them to one system"):
-        open_any(tmp_path)
+    many = open_any(tmp_path)
+    assert many.crs is None
+    assert "b.laz states none" in many.crs_problem
     assert open_any(tmp_path, UTM).crs == UTM
+    assert check_clouds(tmp_path).exit_code == 6
+    assert check_clouds(tmp_path, source_crs="EPSG:25833").exit_code == 0
+
+
+@pytest.fixture
+def tiles(tmp_path):
+    """Two tiles, one without points, and what lies in folders beside clouds."""
+    xyz = np.round(np.random.default_rng(1).uniform(0, 50, (600, 3)) + ORIGIN, 3)
+    folder = tmp_path / "tiles"
+    save(folder, xyz, count=2)
+    save(folder / "empty.las", np.empty((0, 3)))
+    (folder / "notes.txt").write_text("flown in May\nno rain\n")
+    (folder / "table.csv").write_text("tile,points\n0,300\n")
+    (folder / "readme.md").write_text("tiles")
+    return folder
+
+
+@pytest.mark.parametrize("way", ["", "/*", "/*.l*"])
+def test_what_lies_beside_clouds_is_left_out(tiles, way):
+    many = open_any(f"{tiles}{way}")
+    assert isinstance(many, ManyFiles)
+    assert [Path(part.name).name for part in many.parts] == ["empty.las", "tile_00.laz", "tile_01.laz"]
+    assert many.count == 600
+    # the empty one tells nothing of the bounds
+    assert (many.minimum > ORIGIN - 1.0).all()
+    assert {found.code for found in check_clouds(f"{tiles}{way}").findings}.isdisjoint({"outside-area"})
+
+
+def test_texts_alone_are_clouds(tmp_path):
+    for i in range(2):
+        np.savetxt(tmp_path / f"s{i}.txt", np.random.default_rng(i).uniform(0, 9, (50, 3)))
+    assert open_any(tmp_path).count == 100
+    assert open_any(f"{tmp_path}/*.txt", text="x y z").count == 100
+
+
+def test_lists_and_virtual_clouds_as_programs_write_them(tiles, tmp_path):
+    first = tiles / "tile_00.laz"
+    (tmp_path / "list.txt").write_text(f'# tiles\n\n  "tiles/{first.name}"  \n  # none\n')
+    assert open_any(f"@{tmp_path / 'list.txt'}").count == 300
+    assets = {
+        "thumbnail first": {"thumbnail": {"href": "a.png"}, "data": {"href": f"./tiles/{first.name}"}},
+        "by its role": {"a": {"href": "a.png"}, "cloud": {"href": str(first), "roles": ["data"]}},
+        "an address": {"data": {"href": first.as_uri()}},
+    }
+    for name, asset in assets.items():
+        (tmp_path / "one.vpc").write_text(json.dumps({"features": [{"assets": asset}]}))
+        assert open_any(tmp_path / "one.vpc").count == 300, name
+
+
+def test_many_files_are_moved_to_a_folder(tiles, tmp_path):
+    with pytest.raises(InputError, match="name one"):
+        write_moved(tmp_path / "out.laz", Moved(open_any(tiles), lambda xyz: xyz + 1.0, UTM))
+    write_moved(tmp_path / "out", Moved(open_any(tiles), lambda xyz: xyz + 1.0, UTM))
+    assert {one.name: open_cloud(one).count for one in (tmp_path / "out").iterdir()} == {
+        "empty.las": 0, "tile_00.laz": 300, "tile_01.laz": 300,
+    }  # fmt: skip
 
 
 def test_formats_and_scales_may_differ(tmp_path):

@@ -8,7 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mtpcr_geo.benchmark.simulator.kinds import Kind
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.pipeline.options import RUN, Shown, first_problem
+from mtpcr_geo.pipeline.options import first_problem
+from mtpcr_geo.pipeline.shown import RUN, Shown
 
 Ground = Literal["robot", "tripod"]
 Air = Literal["airborne", "uav"]

@@ -15,10 +15,12 @@ from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import CHUNK_POINTS, PointTable
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.io.file_cloud import FileCloud, named, reported, require_xyz
+from mtpcr_geo.io.formats.text_layout import LEFT_OUT, TextLayout
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
+_LONGEST_HEAD = 100
 _BATCH = 200_000  # lines read at once
 _UNNAMED = {
     3: "",
@@ -43,16 +45,17 @@ class TextCloud(FileCloud):
         names: list[str],
         kinds: list[NDArray[np.generic]],
         head: int,
+        layout: TextLayout,
     ) -> None:
         super().__init__(path, crs, "PTS" if path.suffix.lower() == ".pts" else "text", count)
-        self.names, self.kinds, self.head = names, kinds, head
+        self.names, self.kinds, self.head, self.layout = names, kinds, head, layout
 
     def columns(self, size: int) -> Iterator[PointTable]:
         """Yield columns by name."""
         with self.path.open("rb") as stream:
             for _ in range(self.head):
                 stream.readline()
-            for rows in rows_of(stream, size):
+            for rows in rows_of(stream, size, layout=self.layout):
                 yield named(
                     {
                         name: rows[:, i].astype(kind.dtype)
@@ -61,17 +64,18 @@ class TextCloud(FileCloud):
                 )
 
 
-def open_file(path: Path, crs: CRS | None) -> TextCloud:
-    """Open a text file: columns by its first line where that names them, else by their number.
+def open_file(path: Path, crs: CRS | None, layout: TextLayout | None = None) -> TextCloud:
+    """Open a text file: columns as declared, or by its first line where that names them, or by their number.
 
     Raises:
         InputError: if its lines are no points.
 
     """
+    layout = layout or TextLayout()
     with reported(path), path.open("rb") as stream:
-        names, head = _head(path, stream)
+        names, head = _declared_head(stream, layout) if layout.columns else _head(path, stream, layout)
         count, low, high, whole = 0, np.array([]), np.array([]), np.array([])
-        for rows in rows_of(stream, CHUNK_POINTS):
+        for rows in rows_of(stream, CHUNK_POINTS, layout=layout):
             if not count:
                 low, high = rows.min(axis=0), rows.max(axis=0)
                 whole = np.ones(rows.shape[1], bool)
@@ -87,13 +91,15 @@ def open_file(path: Path, crs: CRS | None) -> TextCloud:
             raise InputError(f"{path} names {len(names)} columns and has {len(low)}; correct its first line")
     require_xyz(path, names)
     kinds = [_kind(name, bool(whole[i]), float(low[i]), float(high[i])) for i, name in enumerate(names)]
-    cloud = TextCloud(path, crs, count, names, kinds, head)
+    cloud = TextCloud(path, crs, count, names, kinds, head, layout)
     place = [[name.lower() for name in names].index(axis) for axis in "xyz"]
     cloud.minimum, cloud.maximum = low[place], high[place]
     return cloud
 
 
-def rows_of(stream: BinaryIO, size: int, most: int | None = None) -> Iterator[Floats]:
+def rows_of(
+    stream: BinaryIO, size: int, most: int | None = None, layout: TextLayout | None = None
+) -> Iterator[Floats]:
     """Yield the numbers of lines, (n, columns) float64 with n <= size, from where a stream stands.
 
     Lines of one number, with which PTS files count, and empty ones are passed over.
@@ -102,17 +108,26 @@ def rows_of(stream: BinaryIO, size: int, most: int | None = None) -> Iterator[Fl
         ValueError: if a line holds something else, or another number of columns.
 
     """
+    layout = layout or TextLayout()
+    between = (layout.separator or "").encode()
     columns, left = 0, most
     kept: list[Floats] = []
     while left is None or left > 0:
         wanted = min(_BATCH, size) if left is None else min(_BATCH, size, left)
-        lines = [re.sub(rb"[,;\t]+", b" ", line).split(b"#")[0] for line in islice(stream, wanted)]
+        lines = [_separated(line, layout) for line in islice(stream, wanted)]
         if not lines:
             return
-        lines = [line for line in lines if len(line.split(None, 2)) > 1]
+        lines = [line for line in lines if len(line.split(between or None, 2)) > 1]
         if not lines:
             continue
-        rows = np.loadtxt([line.decode("ascii") for line in lines], ndmin=2)
+        if layout.columns:
+            _check_number(lines[0].split(between or None), layout)
+        rows = np.loadtxt(
+            [line.decode("utf-8" if layout.columns else "ascii") for line in lines],
+            ndmin=2,
+            delimiter=layout.separator or None,
+            usecols=layout.kept or None,
+        )
         if columns and rows.shape[1] != columns:
             raise ValueError(f"a line has {rows.shape[1]} numbers and others {columns}")
         columns = rows.shape[1]
@@ -122,7 +137,51 @@ def rows_of(stream: BinaryIO, size: int, most: int | None = None) -> Iterator[Fl
         yield kept.pop()
 
 
-def _head(path: Path, stream: BinaryIO) -> tuple[list[str], int]:
+def _separated(line: bytes, layout: TextLayout) -> bytes:
+    """Return a line without its comment, with a decimal point, and columns apart; empty ones hold nan."""
+    line = line.split(b"#")[0].strip(b"\r\n ")
+    if layout.separator is None:
+        # a decimal comma leaves semicolons, tabs and blanks
+        line = re.sub(rb"[;\t]+" if layout.decimal == "," else rb"[,;\t]+", b" ", line)
+    elif layout.separator:
+        sign = layout.separator.encode()
+        line = re.sub(re.escape(sign) + rb"[ ]*(?=" + re.escape(sign) + rb"|$)", sign + b"nan", line)
+    return line.replace(b",", b".") if layout.decimal == "," else line
+
+
+def _check_number(fields: list[bytes], layout: TextLayout) -> None:
+    """Refuse a number of columns that is not the declared one.
+
+    Raises:
+        InputError: saying both.
+
+    """
+    if len(fields) != len(layout.columns):
+        raise InputError(
+            f"a line of the text file has {len(fields)} columns, and {len(layout.columns)} are named "
+            f"({' '.join(layout.columns)}); name each, {LEFT_OUT} for those to leave out, and check the "
+            "separator"
+        )
+
+
+def _declared_head(stream: BinaryIO, layout: TextLayout) -> tuple[list[str], int]:
+    """Return the declared names of the columns that are read, and the lines before the points."""
+    names = [_PLACES.get(layout.columns[i].lower(), layout.columns[i]) for i in layout.kept]
+    if layout.skip is not None:
+        for _ in range(layout.skip):
+            stream.readline()
+        return names, layout.skip
+    for number in range(_LONGEST_HEAD):
+        place = stream.tell()
+        line = _separated(stream.readline(), layout).decode("utf-8", errors="replace")
+        fields = line.split(layout.separator or None)
+        if fields and _are_numbers([fields[i] for i in layout.kept if i < len(fields)]) and len(fields) > 1:
+            stream.seek(place)
+            return names, number
+    raise ValueError("none of its first lines is a point")
+
+
+def _head(path: Path, stream: BinaryIO, layout: TextLayout) -> tuple[list[str], int]:
     """Return the names of the columns, if a line gives them, and the lines before the points.
 
     Raises:
@@ -131,9 +190,14 @@ def _head(path: Path, stream: BinaryIO) -> tuple[list[str], int]:
     """
     names: list[str] = []
     other: list[str] = []
-    for number in range(100):
+    skip = layout.skip or 0
+    for _ in range(skip):
+        stream.readline()
+    for number in range(skip, skip + _LONGEST_HEAD):
         place = stream.tell()
         line = stream.readline()
+        if layout.decimal == ",":
+            line = _separated(line, layout)
         text = line.decode("utf-8", errors="replace").strip().lstrip("\ufeff")
         words = [word.strip().strip('"') for word in re.split(r"[,;\s]+", text.lstrip("#/ ")) if word.strip()]
         if line and (not words or not _are_numbers(words) or text.startswith(("#", "//"))):

@@ -11,6 +11,8 @@ from pydantic import BeforeValidator, Field, model_validator
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import CrsError, OptionError
 from mtpcr_geo.io.views import Box, Cropped, Head, Moved, parse_bounds
+from mtpcr_geo.io.write_any import ENDINGS
+from mtpcr_geo.pipeline.file_options import TEXT_GRAMMAR, Scale, TextLayoutText
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 
 if TYPE_CHECKING:
@@ -102,16 +104,25 @@ class LasReader(Stage):
 
         override = stated_crs(self, "override_srs", self.options.override_srs)
         default = stated_crs(self, "default_srs", self.options.default_srs)
-        cloud = open_any(self.options.filename, override)
+        text = self.options.text if isinstance(self.options, FileReaderOptions) else None
+        cloud = open_any(self.options.filename, override, text)
         if cloud.crs is None and default is not None:
-            cloud = open_any(self.options.filename, default)
+            cloud = open_any(self.options.filename, default, text)
         return cloud
+
+
+class FileReaderOptions(LasReaderOptions):
+    """Options of mtpcr.read."""
+
+    filename: FileName = Field(description="file of any format that is read, or what names many")
+    text: TextLayoutText | None = Field(None, description=f"layout of a file that is text: {TEXT_GRAMMAR}")
 
 
 class FileReader(LasReader):
     """Read a cloud in any format that is read without PDAL, or many files as one."""
 
     type: ClassVar[str] = "mtpcr.read"
+    Options: ClassVar[OptionsModel] = FileReaderOptions
 
     def reads(self) -> list[Path]:
         """Name the files."""
@@ -254,15 +265,63 @@ class LasWriter(Stage):
         return cloud
 
 
+class FileWriterOptions(StageOptions):
+    """Options of mtpcr.write."""
+
+    filename: Path = Field(description="file to write; its ending is the format")
+    a_srs: str | None = Field(None, description="CRS to state instead of the cloud's own")
+    scale: Scale = None
+
+    @model_validator(mode="after")
+    def _check(self) -> FileWriterOptions:
+        if self.filename.suffix.lower() not in ENDINGS:
+            raise ValueError(f"the file ends in none of {', '.join(ENDINGS)}, which are the formats written")
+        return self
+
+
+class FileWriter(Stage):
+    """Write a cloud in any format that is written: LAS, LAZ, COPC, PLY, PCD, XYZ, CSV, NPY or E57."""
+
+    type: ClassVar[str] = "mtpcr.write"
+    Options: ClassVar[OptionsModel] = FileWriterOptions
+    options: FileWriterOptions
+
+    def writes(self) -> list[Path]:
+        """Name the file."""
+        return [self.options.filename]
+
+    def check(self, context: RunContext) -> None:
+        """Read the CRS option."""
+        stated_crs(self, "a_srs", self.options.a_srs)
+
+    def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
+        """Stream the cloud to the file, and hand it on."""
+        from mtpcr_geo.io.write_any import write_any
+
+        cloud = one_cloud(self, inputs)
+        crs = stated_crs(self, "a_srs", self.options.a_srs) or cloud.crs
+        path = context.outputs.path(self.options.filename)
+        base, move = (cloud.base, cloud.move) if isinstance(cloud, Moved) else (cloud, None)
+        with context.progress.task(f"writing {self.options.filename.name}", cloud.count) as advance:
+            left_out = write_any(path, base, move, crs, self.options.scale, advance=advance)
+        self.metadata |= {"filename": str(self.options.filename), "count": cloud.count - left_out.points}
+        if left_out.points:
+            self.metadata["left_out"] = left_out.points
+        if left_out.dimensions:
+            self.metadata["dimensions_left_out"] = list(left_out.dimensions)
+        return cloud
+
+
 class EachWriterOptions(StageOptions):
     """Options of mtpcr.write_each."""
 
     filename: Path = Field(description="files to write, with a # for their names")
     names: list[str] = Field(description="a name for each file of the cloud, in their order", min_length=1)
+    scale: Scale = None
 
 
 class EachWriter(Stage):
-    """Write a cloud of many files as many files: LAS 1.4 or LAZ, as writers.las does."""
+    """Write a cloud of many files as many files, as mtpcr.write does."""
 
     type: ClassVar[str] = "mtpcr.write_each"
     Options: ClassVar[OptionsModel] = EachWriterOptions
@@ -275,7 +334,7 @@ class EachWriter(Stage):
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Stream each part to its file, and hand the cloud on."""
         from mtpcr_geo.io.many import ManyFiles
-        from mtpcr_geo.io.write import write_cloud
+        from mtpcr_geo.io.write_any import write_any
 
         cloud = one_cloud(self, inputs)
         base, move = (cloud.base, cloud.move) if isinstance(cloud, Moved) else (cloud, None)
@@ -284,13 +343,18 @@ class EachWriter(Stage):
             raise OptionError(
                 f"{self.label}: {len(parts)} files are to be written, and {len(self.options.names)} named"
             )
-        left_out = 0
+        left_out, dimensions = 0, dict[str, None]()
         with context.progress.task(f"writing {len(parts)} files", cloud.count) as advance:
             for part, final in zip(parts, self.writes(), strict=True):
-                left_out += write_cloud(context.outputs.path(final), part, move, cloud.crs, advance=advance)
+                path, scale = context.outputs.path(final), self.options.scale
+                missing = write_any(path, part, move, cloud.crs, scale, advance=advance)
+                left_out += missing.points
+                dimensions |= dict.fromkeys(missing.dimensions)
         self.metadata |= {"filename": str(self.options.filename), "count": cloud.count - left_out}
         if left_out:
             self.metadata["left_out"] = left_out
+        if dimensions:
+            self.metadata["dimensions_left_out"] = list(dimensions)
         return cloud
 
 

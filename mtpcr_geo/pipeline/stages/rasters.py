@@ -116,6 +116,7 @@ class Level(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Scan, sample and level each cloud."""
+        from mtpcr_geo.io.file_cloud import precision_remark
         from mtpcr_geo.io.las import check_distinct
         from mtpcr_geo.io.sample import header_remark, scan
         from mtpcr_geo.method.levelling import level
@@ -147,8 +148,8 @@ class Level(Stage):
                 "sampled": len(scanned.sample),
                 **levelling.audit(),
             }
-            remark = header_remark(cloud, scanned.whole)
-            remarks = () if remark is None else (remark,)
+            found_remarks = header_remark(cloud, scanned.whole), precision_remark(cloud, scanned.sample)
+            remarks = tuple(remark for remark in found_remarks if remark is not None)
             if remarks:
                 self.metadata[role]["header_remarks"] = list(remarks)
             sides.append(

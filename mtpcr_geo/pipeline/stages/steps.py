@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
+from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.io.file_cloud import FileCloud
 from mtpcr_geo.io.formats import LAS_ENDINGS, files_at
 from mtpcr_geo.io.las import LasCloud
 from mtpcr_geo.io.many import ManyFiles, is_many, output_names
 from mtpcr_geo.io.memory import cloud_of
-from mtpcr_geo.pipeline.options import OUTPUT_NAMES, MethodOptions, PriorOptions
+from mtpcr_geo.io.write import is_copc
+from mtpcr_geo.io.write_any import ENDINGS
+from mtpcr_geo.pipeline.file_options import AlsoFormat
+from mtpcr_geo.pipeline.options import OUTPUT_NAMES, MethodOptions, PriorOptions, RegisterOptions
 from mtpcr_geo.pipeline.stage import Stage
 from mtpcr_geo.pipeline.stages.export import (
     Apply,
@@ -34,6 +38,9 @@ from mtpcr_geo.pipeline.stages.io import (
     EachWriter,
     EachWriterOptions,
     FileReader,
+    FileReaderOptions,
+    FileWriter,
+    FileWriterOptions,
     LasReader,
     LasReaderOptions,
     LasWriter,
@@ -168,18 +175,33 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
     ]
 
 
-def reader_of(cloud: CloudLike, tag: str) -> Stage:
-    """Make the stage that reads a file, or returns a cloud in memory."""
+def reader_of(cloud: CloudLike, tag: str, text: str | None = None) -> Stage:
+    """Make the stage that reads a file, or returns a cloud in memory.
+
+    Args:
+        cloud: what to read.
+        tag: of the stage.
+        text: layout of a file that is text.
+
+    """
     if not isinstance(cloud, str | os.PathLike):
         return MemoryReader(cloud_of(cloud, tag), tag)
     path = Path(cloud)
-    if is_many(path):
-        return FileReader(LasReaderOptions(filename=path), tag)
+    if is_many(path) or text is not None:
+        return FileReader(FileReaderOptions(filename=path, text=text), tag)
     if path.name.lower().endswith(".copc.laz"):
         return CopcReader(CopcReaderOptions(filename=path), tag)
     if path.suffix.lower() not in LAS_ENDINGS:
-        return FileReader(LasReaderOptions(filename=path), tag)
+        return FileReader(FileReaderOptions(filename=path), tag)
     return LasReader(LasReaderOptions(filename=path), tag)
+
+
+def readers_of(source: CloudLike, target: CloudLike, options: RegisterOptions) -> list[Stage]:
+    """Make the stages that read the target and the source."""
+    return [
+        reader_of(target, "target", options.target_text),
+        reader_of(source, "source", options.source_text),
+    ]
 
 
 def recording_writer(folder: Path) -> Stage:
@@ -196,6 +218,36 @@ def part_names(source: object) -> list[str]:
     return []
 
 
+def further_files(folder: Path) -> list[Path]:
+    """Return the files that an earlier run may have left in a folder, and not every run writes."""
+    registered = folder / OUTPUT_NAMES["registered"]
+    endings = [f".{one}" for one in get_args(AlsoFormat) if one != "input"]
+    return [folder / OUTPUT_NAMES["recording"], *(registered.with_suffix(one) for one in endings)]
+
+
+def writers_for(
+    source: CloudLike | None, folder: Path, options: RegisterOptions, recording: Path | None = None
+) -> list[Stage]:
+    """Make the stages behind the verdict, as the options of a registration want them.
+
+    Args:
+        source: the cloud that moves; None where there is none.
+        folder: where the files go.
+        options: of the registration.
+        recording: a recording of it that is there already.
+
+    """
+    return writers_of(
+        folder,
+        force=options.force,
+        recorded=options.recording,
+        recording=recording,
+        parts=part_names(source),
+        scale=options.scale,
+        also=also_of(source, options.also),
+    )
+
+
 def writers_of(
     folder: Path,
     *,
@@ -203,6 +255,8 @@ def writers_of(
     recorded: bool = False,
     recording: Path | None = None,
     parts: Sequence[str] = (),
+    scale: float | None = None,
+    also: str | None = None,
 ) -> list[Stage]:
     """Make the stages behind the verdict that leave files.
 
@@ -212,6 +266,8 @@ def writers_of(
         recorded: record the run.
         recording: a recording of it that is there already.
         parts: names of the files of a source of many; the moved ones are written under them.
+        scale: storage step of the registered cloud; None chooses it.
+        also: ending, without the dot, of a further format in which it is written.
 
     """
     where = {name: folder / file for name, file in OUTPUT_NAMES.items()}
@@ -231,7 +287,53 @@ def writers_of(
         WriteReport(FileOptions(filename=where["report"]), "report"),
         WriteRun(FileOptions(filename=where["run"]), "run"),
         Apply(ApplyOptions(force=force), "moved"),
-        EachWriter(EachWriterOptions(filename=folder / "registered" / "#", names=list(parts)), "registered")
-        if parts
-        else LasWriter(LasWriterOptions(filename=where["registered"]), "registered"),
+        *_cloud_writers(folder, parts, scale, also),
     ]
+
+
+def _cloud_writers(
+    folder: Path, parts: Sequence[str], scale: float | None, also: str | None
+) -> Iterator[Stage]:
+    """Yield the stages that write the registered cloud: as LAZ, and in the format asked for."""
+    if not parts:
+        scales = {f"scale_{axis}": scale for axis in "xyz"}
+        whole = folder / OUTPUT_NAMES["registered"]
+        yield LasWriter(LasWriterOptions(filename=whole, **scales), "registered")
+        if also is not None:
+            options = FileWriterOptions(filename=whole.with_suffix(f".{also}"), scale=scale)
+            yield FileWriter(options, "registered_also")
+        return
+    each = folder / "registered" / "#"
+    yield EachWriter(EachWriterOptions(filename=each, names=list(parts), scale=scale), "registered")
+    if also is not None:
+        names = [f"{name.removesuffix('.laz').removesuffix('.copc')}.{also}" for name in parts]
+        taken = [name for name in names if name in parts]
+        if not taken:
+            options_of_each = EachWriterOptions(filename=each, names=names, scale=scale)
+            yield EachWriter(options_of_each, "registered_also")
+
+
+def also_of(source: object, also: str | None) -> str | None:
+    """Return the ending of the further format: of ``input`` that of the source.
+
+    Raises:
+        OptionError: if that is no format that is written.
+
+    """
+    if also != "input":
+        return also
+    if isinstance(source, str | os.PathLike):
+        path = files_at(Path(source))[0]
+    elif isinstance(source, ManyFiles):
+        path = Path(source.parts[0].name)
+    elif isinstance(source, Cloud):
+        path = Path(source.name)
+    else:
+        path = Path("memory")
+    ending = ".copc.laz" if is_copc(path) else path.suffix.lower()
+    if ending != ".copc.laz" and ending not in ENDINGS:
+        raise OptionError(
+            f"--also input: {path.name} is of no format that is written; name one of "
+            f"{', '.join(one[1:] for one in ENDINGS)}"
+        )
+    return None if ending == ".laz" else ending[1:]
