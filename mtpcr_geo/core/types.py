@@ -23,6 +23,7 @@ from mtpcr_geo.core.fits import Solution as Solution
 from mtpcr_geo.core.fits import SolveSettings as SolveSettings
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.prior import KnownPlace as KnownPlace
+from mtpcr_geo.core.wording import visible
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.frames import FrameLink, WorkFrame
@@ -307,6 +308,10 @@ class Verdict:
     reasons: tuple[str, ...]
     metrics: dict[str, Any]
     rivals: tuple[Rival, ...] = ()
+
+    def __post_init__(self) -> None:
+        # they name clouds and CRSs, and go to terminals, pages and files
+        object.__setattr__(self, "reasons", tuple(visible(reason) for reason in self.reasons))
 
     @property
     def withholds_transform(self) -> str | None:

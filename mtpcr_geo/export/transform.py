@@ -16,6 +16,7 @@ from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.core.frames import FrameLink, OperationReport, Vertical
 from mtpcr_geo.core.scanner import Scanner
 from mtpcr_geo.core.units import Axes, Unit
+from mtpcr_geo.core.wording import visible
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.crs.facts import facts_of
 
@@ -109,7 +110,7 @@ def write_cloudcompare_matrix(path: str | Path, pair: Pair) -> None:
     for role in ("source", "target"):
         shift = " ".join(f"{value + 0.0:.17g}" for value in found[f"{role}_global_shift"])
         rows.append(f"# {role} global shift: {shift}")
-    Path(path).write_text("\n".join([*rows, f"# {found['note']}"]) + "\n", encoding="utf-8")
+    Path(path).write_text(visible("\n".join([*rows, f"# {found['note']}"])) + "\n", encoding="utf-8")
 
 
 def read_transform(path: str | Path) -> TransformChain:

@@ -13,6 +13,7 @@ import numpy as np
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.core.version import __version__
+from mtpcr_geo.core.wording import visible
 from mtpcr_geo.crs import TransformChain
 from mtpcr_geo.export import charts, descriptions, drawing
 from mtpcr_geo.export.tie_points import footprints, tie_positions
@@ -81,7 +82,7 @@ def write_report(
         f"{''.join(sections)}</main></body></html>\n"
     )
     try:
-        Path(path).write_text(html, encoding="utf-8")
+        Path(path).write_text(visible(html), encoding="utf-8")
     except OSError as error:
         raise OutputError(f"cannot write the report {path}: {error.strerror}") from error
 
