@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 KIND, VERSION, TURNED = "mtpcr-geo transform", 1, 2
 _SHARED_SHIFT = 10_000.0  # beyond this, single precision would show in one common shift
 _EARTH_RADIUS = 6_371_000.0
+_RIGID = 1e-6
 
 
 def write_transform_json(path: str | Path, pair: Pair, *, forced: bool = False) -> None:
@@ -145,11 +146,26 @@ def read_transform(path: str | Path) -> TransformChain:
             pivot=_array(document["pivot"]["source"], (3,)),
             bounds=_array(chain["source_bounds"], (2, 3)),
         )
+        _check_rigid(result.T_target_source)
     except (KeyError, TypeError, ValueError, OverflowError, IndexError) as error:
         raise InputError(
             f"{path} is damaged ({type(error).__name__}: {error}); register again to write a new one"
         ) from error
     return result
+
+
+def _check_rigid(T: Floats) -> None:
+    """Refuse a 4x4 that no registration gives.
+
+    Raises:
+        ValueError: if it mirrors, stretches or is not finite.
+
+    """
+    R = T[:3, :3]
+    with np.errstate(all="ignore"):
+        rigid = np.allclose(R @ R.T, np.eye(3), rtol=0, atol=_RIGID) and np.linalg.det(R) > 0
+    if not (np.isfinite(T).all() and rigid and (T[3] == [0, 0, 0, 1]).all()):
+        raise ValueError("T_target_source is no rigid transform")
 
 
 def doubts_of(path: str | Path) -> str | None:

@@ -52,27 +52,29 @@ def settled(cloud: Cloud, move: Move | None, scales: Floats, coarsest: Floats | 
         InputError: if the cloud cannot be read.
 
     """
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    looked = []
-    for xyz in cloud.xyz_chunks():
-        moved = xyz if move is None else move(xyz)
-        low, high = np.minimum(low, moved.min(axis=0)), np.maximum(high, moved.max(axis=0))
-        looked.append(moved[:: max(1, len(moved) // _LOOKED_AT)])
-    some = np.concatenate(looked)
-    middle, half = np.rint((low + high) / 2), (high - low) / 2 + 1.0
-    grown = scales.copy()
-    while coarsest is not None and (half / grown > MOST_STEPS).any() and (grown < coarsest).any():
-        grown = np.minimum(grown * 10, np.maximum(coarsest, scales))
-    if (half / grown <= MOST_STEPS).all():
-        return Storage(grown, middle)
-    # the finer scale again: a few points far away shall not cost the others their digits
-    for wanted in (scales, grown):
-        offsets = np.rint(np.median(some, axis=0))
-        misfit = (np.abs(some - offsets) / wanted > MOST_STEPS).any(axis=1)
-        if misfit.mean() <= FEW_SHARE:
-            return Storage(wanted, offsets)
-    distance = float(np.abs(some - offsets).max())
+    # coordinates of a broken file may be of any size
+    with np.errstate(over="ignore", invalid="ignore"):
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        looked = []
+        for xyz in cloud.xyz_chunks():
+            moved = xyz if move is None else move(xyz)
+            low, high = np.minimum(low, moved.min(axis=0)), np.maximum(high, moved.max(axis=0))
+            looked.append(moved[:: max(1, len(moved) // _LOOKED_AT)])
+        some = np.concatenate(looked)
+        middle, half = np.rint((low + high) / 2), (high - low) / 2 + 1.0
+        grown = scales.copy()
+        while coarsest is not None and (half / grown > MOST_STEPS).any() and (grown < coarsest).any():
+            grown = np.minimum(grown * 10, np.maximum(coarsest, scales))
+        if (half / grown <= MOST_STEPS).all():
+            return Storage(grown, middle)
+        # the finer scale again: a few points far away shall not cost the others their digits
+        for wanted in (scales, grown):
+            offsets = np.rint(np.median(some, axis=0))
+            misfit = (np.abs(some - offsets) / wanted > MOST_STEPS).any(axis=1)
+            if misfit.mean() <= FEW_SHARE:
+                return Storage(wanted, offsets)
+        distance = float(np.abs(some - offsets).max())
     raise OutputError(
-        f"{misfit.mean():.0%} of the points, up to {distance:.0f} from the others, do not fit a LAS file at "
+        f"{misfit.mean():.0%} of the points, up to {distance:.6g} from the others, do not fit a LAS file at "
         f"scale {grown.min():g}; give a coarser scale (scale_x ... of writers.las), or take them apart"
     )

@@ -143,10 +143,14 @@ def returning_scales(cloud: Cloud, crs: CRS | None) -> Floats:
         if cloud.crs is not None and cloud.crs.is_geographic:
             scales[:2] *= _METRES_A_DEGREE
         scales = np.clip(scales, FINEST_STEP / 10, STEP)
-    extent = cloud.maximum - cloud.minimum
-    if cloud.crs is None or not cloud.crs.is_geographic:
-        while np.isfinite(extent).all() and scales.min() < STEP and extent.max() / scales.min() > MOST_STEPS:
-            scales = np.minimum(scales * 10, STEP)
+    # headers may state bounds of any size
+    with np.errstate(over="ignore"):
+        extent = cloud.maximum - cloud.minimum
+        if cloud.crs is None or not cloud.crs.is_geographic:
+            while (
+                np.isfinite(extent).all() and scales.min() < STEP and extent.max() / scales.min() > MOST_STEPS
+            ):
+                scales = np.minimum(scales * 10, STEP)
     if crs is not None and crs.is_geographic:
         scales[:2] = np.minimum(scales[:2] / _METRES_A_DEGREE, DEGREE_STEP)
     return scales
@@ -228,11 +232,13 @@ def _placed(
     header.scales = storage.scales
     offsets = storage.offsets
     for xyz, packed in chunks:
-        moved = xyz if move is None else move(xyz)
-        if offsets is None:
-            offsets = np.rint((moved.min(axis=0) + moved.max(axis=0)) / 2)
-        header.offsets = offsets
-        steps = np.rint((moved - offsets) / storage.scales)
+        # of a broken file a point may lie anywhere; what does not fit is found below
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved = xyz if move is None else move(xyz)
+            if offsets is None:
+                offsets = np.rint((moved.min(axis=0) + moved.max(axis=0)) / 2)
+            header.offsets = offsets
+            steps = np.rint((moved - offsets) / storage.scales)
         worst = float(np.abs(steps).max())
         kept = packed
         if not worst <= MOST_STEPS:

@@ -132,7 +132,7 @@ class RecordingWriter:
 
     def _log_frame(self, pair: Pair, sides: list[Side]) -> None:
         names = [Path(side.cloud.name).name for side in sides]
-        self._stream.send_recording_name(" to ".join(names))
+        self._stream.send_recording_name(visible(" to ".join(names)))
         crs = pair.frame.crs
         frame = {
             "crs": crs.name if crs is not None else "local",
@@ -307,10 +307,12 @@ class RecordingWriter:
         return xyz[((np.arange(budget) + jitter) * (len(xyz) / budget)).astype(np.int64)]
 
     def _send_properties(self, name: str, values: Mapping[str, Any]) -> None:
-        texts = {str(key).replace("-", "_"): descriptions.plain(value) for key, value in values.items()}
+        texts = {
+            visible(str(key)).replace("-", "_"): descriptions.plain(value) for key, value in values.items()
+        }
         texts = {key: visible(text) for key, text in texts.items() if text}
         if texts:
-            self._stream.send_property(name.replace("-", "_"), rr.AnyValues(**texts))
+            self._stream.send_property(visible(name).replace("-", "_"), rr.AnyValues(**texts))
 
     @staticmethod
     def _markdown(text: str) -> Any:

@@ -67,4 +67,6 @@ def _scans(stream: BinaryIO) -> Iterator[tuple[int, Floats]]:
         T = np.array(head[4:], np.float64)
         if T.shape != (4, 4):
             raise ValueError("the 4x4 of a scan is none")
+        if not (np.isfinite(T).all() and np.linalg.det(T[:3, :3]) > 0):
+            raise ValueError("the 4x4 of a scan mirrors it, or is no transform")
         yield columns * rows, T
