@@ -27,7 +27,8 @@ class PtxCloud(FileCloud):
         with self.path.open("rb") as stream:
             for number, (count, T) in enumerate(_scans(stream), 1):
                 for rows in rows_of(stream, size, most=count):
-                    xyz = rows[:, :3] @ T[:3, :3] + T[3, :3]
+                    with np.errstate(over="ignore", invalid="ignore"):
+                        xyz = rows[:, :3] @ T[:3, :3] + T[3, :3]
                     columns = {axis: xyz[:, i] for i, axis in enumerate("xyz")}
                     if rows.shape[1] > 3:
                         columns["intensity"] = rows[:, 3]
