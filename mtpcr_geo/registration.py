@@ -24,6 +24,7 @@ from mtpcr_geo.core.errors import MissingPartError, OptionError, RegistrationErr
 from mtpcr_geo.core.progress import Progress
 from mtpcr_geo.core.types import Floats, Pair, Verdict
 from mtpcr_geo.core.uncertainty import Uncertainty
+from mtpcr_geo.core.wording import visible
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.export.apply import move, moved_by, write_moved
 from mtpcr_geo.io.memory import cloud_of, coordinates
@@ -249,12 +250,12 @@ class Registration:
         rows = self._rows()
         width = max((len(name) for name, _ in rows), default=0)
         lines = [f"Registration: {self.verdict.name}", f"  {self.verdict.headline}"]
-        return "\n".join(lines + [f"  {name:<{width}}  {text}" for name, text in rows])
+        return visible("\n".join(lines + [f"  {name:<{width}}  {text}" for name, text in rows]))
 
     def _repr_html_(self) -> str:
         rows = "".join(
             f"<tr><th style='text-align:left'>{escape(name)}</th>"
-            f"<td style='text-align:left'>{escape(text)}</td></tr>"
+            f"<td style='text-align:left'>{escape(visible(text))}</td></tr>"
             for name, text in self._rows()
         )
         head = f"<b>Registration: {escape(self.verdict.name)}</b><p>{escape(self.verdict.headline)}</p>"

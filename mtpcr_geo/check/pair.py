@@ -387,7 +387,8 @@ def same_points_findings(source: Inspection, target: Inspection) -> Iterator[Fin
         float(np.max(getattr(getattr(one.cloud, "header", None), "scales", 0.001)))
         for one in (source, target)
     )
-    if not step > 0:
+    farthest = max(float(np.abs(one.scan.sample).max(initial=0.0)) for one in (source, target) if one.scan)
+    if not step > farthest / 2**62:
         return
     few = source.scan.sample[:: max(1, len(source.scan.sample) // _COMPARED)]
     there = {row.tobytes() for row in np.rint(target.scan.sample / step).astype(np.int64)}

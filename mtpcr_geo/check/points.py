@@ -73,6 +73,9 @@ def bounds_findings(cloud: LasCloud, whole: Floats, role: Role) -> Iterator[Find
         return
     outside = np.maximum(cloud.minimum - low, high - cloud.maximum)
     spare = np.maximum(low - cloud.minimum, cloud.maximum - high)
+    with np.errstate(over="ignore"):
+        # the header may state bounds of any size
+        outside_steps, spare_steps = outside / tolerance, spare / tolerance
     if (outside > tolerance).any() and not np.any([cloud.minimum, cloud.maximum]):
         yield Finding(
             "warning",
@@ -83,7 +86,7 @@ def bounds_findings(cloud: LasCloud, whole: Floats, role: Role) -> Iterator[Find
             rewrite(cloud.path),
         )
     elif (outside > tolerance).any():
-        axis = int((outside / tolerance).argmax())
+        axis = int(outside_steps.argmax())
         yield Finding(
             "warning",
             "bounds-wrong",
@@ -93,7 +96,7 @@ def bounds_findings(cloud: LasCloud, whole: Floats, role: Role) -> Iterator[Find
             rewrite(cloud.path),
         )
     elif (spare > tolerance).any():
-        axis = int((spare / tolerance).argmax())
+        axis = int(spare_steps.argmax())
         extent = float((high - low)[axis])
         yield Finding(
             "warning" if spare[axis] > max(extent, 1.0) else "note",

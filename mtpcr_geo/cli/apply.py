@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import typer
-
 from mtpcr_geo.cli.options import ApplyVerb
 from mtpcr_geo.cli.parameters import command_of
-from mtpcr_geo.cli.shared import progress_bars
+from mtpcr_geo.cli.shared import progress_bars, say, warn
 
 
 def run(options: ApplyVerb) -> None:
@@ -17,7 +15,6 @@ def run(options: ApplyVerb) -> None:
         mtpcr-geo apply out/transform.json moved.laz back.laz --inverse
 
     """
-    from mtpcr_geo.core.errors import one_line
     from mtpcr_geo.export.apply import apply_transform
     from mtpcr_geo.export.transform import doubts_of
 
@@ -31,13 +28,13 @@ def run(options: ApplyVerb) -> None:
             scale=options.scale,
             overwrite=options.overwrite,
             progress=progress,
-            say=lambda text: typer.echo(one_line(f"mtpcr-geo: warning: {text}"), err=True),
+            say=warn,
         )
     doubts = doubts_of(options.transform)
     if doubts is not None:
-        typer.echo(one_line(f"mtpcr-geo: warning: {doubts}"), err=True)
+        warn(doubts)
     if not options.quiet:
-        typer.echo(f"wrote {written}")
+        say(f"wrote {written}")
 
 
 command = command_of(ApplyVerb, run)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import typer
-
 from mtpcr_geo.cli.options import DemoVerb
 from mtpcr_geo.cli.parameters import command_of
-from mtpcr_geo.cli.shared import end_with, progress_bars
+from mtpcr_geo.cli.shared import end_with, progress_bars, say
 
 
 def run(options: DemoVerb) -> None:
@@ -25,7 +23,7 @@ def run(options: DemoVerb) -> None:
     if not options.quiet:
         # the summary names the files
         print_registration(result.registration, files=False)
-        typer.echo(result.summary)
+        say(result.summary)
     raise end_with(result.registration.verdict, quiet=options.quiet)
 
 

@@ -6,7 +6,7 @@ import typer
 
 from mtpcr_geo.cli.options import ModelsVerb
 from mtpcr_geo.cli.parameters import command_of
-from mtpcr_geo.cli.shared import json_text
+from mtpcr_geo.cli.shared import json_text, say
 
 
 def run(options: ModelsVerb) -> None:
@@ -24,18 +24,16 @@ def run(options: ModelsVerb) -> None:
     if options.as_json:
         typer.echo(json_text({"folder": folder, "models": found}))
         return
-    typer.echo(
-        f"models folder: {folder}" if folder else f"no models folder (give --models, or set {VARIABLE})"
-    )
+    say(f"models folder: {folder}" if folder else f"no models folder (give --models, or set {VARIABLE})")
     for model in found:
-        typer.echo(f"\n{model['name']}: {model['title']}{'' if model['usable'] else ' - not usable yet'}")
+        say(f"\n{model['name']}: {model['title']}{'' if model['usable'] else ' - not usable yet'}")
         for name, file in model["files"].items():
-            typer.echo(f"  {name}: " + (f"sha256 {file['sha256']}" if file else "missing"))
-        typer.echo(f"  licence: {model['licence']}")
+            say(f"  {name}: " + (f"sha256 {file['sha256']}" if file else "missing"))
+        say(f"  licence: {model['licence']}")
         if model["terms"]:
-            typer.echo(f"  terms: {model['terms']}")
-        typer.echo(f"  published by: {model['project']}")
-    typer.echo("\ncorrelation, rootsift and orb need no files and are always there")
+            say(f"  terms: {model['terms']}")
+        say(f"  published by: {model['project']}")
+    say("\ncorrelation, rootsift and orb need no files and are always there")
 
 
 command = command_of(ModelsVerb, run)

@@ -13,6 +13,7 @@ import typer
 from mtpcr_geo.cli import options
 from mtpcr_geo.cli.parameters import switch
 from mtpcr_geo.core.errors import EXIT_DOUBTFUL, EXIT_REFUSED, one_line
+from mtpcr_geo.core.wording import visible
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.progress import Progress
@@ -36,6 +37,16 @@ def progress_bars(quiet: bool, always: bool = False) -> Iterator[Progress]:
 
     with RichProgress(Console(stderr=True, force_terminal=True if always else None)) as bars:
         yield bars
+
+
+def say(text: str) -> None:
+    """Print lines on standard output, with what a terminal would obey written as escapes."""
+    typer.echo(visible(text))
+
+
+def warn(text: str) -> None:
+    """Print a warning in one line on standard error."""
+    typer.echo(one_line(f"mtpcr-geo: warning: {text}"), err=True)
 
 
 def end_with(verdict: Verdict | None, *, quiet: bool) -> typer.Exit:

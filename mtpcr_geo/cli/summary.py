@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.wording import visible
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -68,18 +69,18 @@ def print_registration(
     head, _, rest = result.verdict.headline.partition(":")
     console.print(Text.assemble((f"{head}:", _COLOUR[name]), rest), soft_wrap=True)
     for reason in result.verdict.reasons:
-        console.print(Text(f"  {reason}"), soft_wrap=True)
+        console.print(Text(visible(f"  {reason}")), soft_wrap=True)
     facts = Table(box=None, show_header=False, pad_edge=True, padding=(0, 1))
     for label, value in (*_transform_rows(result), *_metric_rows(result.verdict.metrics, verbose)):
-        facts.add_row(label, value)
+        facts.add_row(Text(visible(label)), Text(visible(value)))
     if facts.row_count:
         console.print(facts)
     if verbose:
         _print_stages(result.report)
     for path, what in _to_open(result).items() if files else ():
-        console.print(Text(f"  {path}"), Text(what, "dim"), soft_wrap=True)
+        console.print(Text(visible(f"  {path}")), Text(what, "dim"), soft_wrap=True)
     for line in (*_withheld_lines(result, force_with), *_left_out_lines(result)):
-        console.print(Text(f"  {line}", "dim"), soft_wrap=True)
+        console.print(Text(visible(f"  {line}"), "dim"), soft_wrap=True)
 
 
 def print_run(result: RunResult, *, verbose: bool = False, console: Console | None = None) -> None:
@@ -97,7 +98,7 @@ def print_run(result: RunResult, *, verbose: bool = False, console: Console | No
         _print_stages(result.done)
     for path in result.outputs:
         if path not in named:
-            console.print(f"  wrote {path}", soft_wrap=True, markup=False)
+            console.print(visible(f"  wrote {path}"), soft_wrap=True, markup=False)
 
 
 def _withheld_lines(result: Registration, force_with: str) -> list[str]:
@@ -172,4 +173,4 @@ def _print_stages(done: Sequence[StageRecord]) -> None:
     for record in done:
         note = record.skipped or record.failed or ""
         text = f"  {record.seconds:8.2f} s  {record.tag} ({record.type}) {note}".rstrip()
-        talk.print(text, soft_wrap=True, markup=False)
+        talk.print(visible(text), soft_wrap=True, markup=False)

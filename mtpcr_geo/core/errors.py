@@ -19,6 +19,8 @@ code  meaning
 ====  ==============================================================
 """
 
+from mtpcr_geo.core.wording import visible
+
 EXIT_DOUBTFUL = 3
 EXIT_REFUSED = 4
 EXIT_DEFECT = 70
@@ -26,15 +28,17 @@ EXIT_INTERRUPTED = 130
 
 
 def one_line(text: str) -> str:
-    """Return a message in one line, with control characters written as escapes."""
-    line = " ".join(text.split())
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in line)
+    """Return a message in one line, with characters that are not shown written as escapes."""
+    return visible(" ".join(text.split()))
 
 
 class MtpcrError(Exception):
     """Base of every error a user can cause."""
 
     exit_code = 1
+
+    def __str__(self) -> str:
+        return visible(super().__str__())
 
 
 class OptionError(MtpcrError):

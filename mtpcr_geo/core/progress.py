@@ -7,6 +7,8 @@ from contextlib import AbstractContextManager, contextmanager
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
+from mtpcr_geo.core.wording import visible
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -39,7 +41,7 @@ class RichProgress:
         from rich import progress
 
         self._bars = progress.Progress(
-            progress.TextColumn("{task.description}"),
+            progress.TextColumn("{task.description}", markup=False),
             progress.BarColumn(),
             progress.TimeElapsedColumn(),
             console=console,
@@ -59,7 +61,7 @@ class RichProgress:
     @contextmanager
     def task(self, what: str, total: int | None = None) -> Iterator[Advance]:
         """Open a bar, or a pulsing one where the total is not known."""
-        bar = self._bars.add_task(what, total=total)
+        bar = self._bars.add_task(visible(what), total=total)
         try:
             yield lambda count: self._bars.advance(bar, count)
         finally:

@@ -24,6 +24,7 @@ from mtpcr_geo.core.fits import SolveSettings as SolveSettings
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.prior import KnownPlace as KnownPlace
 from mtpcr_geo.core.uncertainty import Uncertainty
+from mtpcr_geo.core.wording import visible
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.frames import FrameLink, WorkFrame
@@ -350,6 +351,11 @@ class Verdict:
     def headline(self) -> str:
         """The sentence, or where nothing was judged the verdict and its first reason."""
         return self.sentence or f"{self.name.capitalize()}: {'; '.join(self.reasons[:1]) or 'not judged'}."
+
+    def __post_init__(self) -> None:
+        # they name clouds and CRSs, and go to terminals, pages and files
+        object.__setattr__(self, "reasons", tuple(visible(reason) for reason in self.reasons))
+        object.__setattr__(self, "sentence", visible(self.sentence))
 
     @property
     def withholds_transform(self) -> str | None:

@@ -1,4 +1,4 @@
-"""How numbers are worded, so that what is printed says what was decided."""
+"""How numbers and texts are worded, so that what is printed says what was decided, and nothing else."""
 
 from __future__ import annotations
 
@@ -42,3 +42,17 @@ def only(number: int, one: str, many: str | None = None) -> str:
     """Return a number with its noun: "no tie points", "only 1 tie point", "only 3 tie points"."""
     nouns = one if number == 1 else many or one + "s"
     return f"only {number:,} {nouns}" if number else f"no {nouns}"
+
+
+def visible(text: str) -> str:
+    """Return a text with every character that is not shown written as an escape; line ends stay.
+
+    Names of files, CRSs and stages come from strangers: a terminal obeys escape sequences, a browser
+    right-to-left marks, and half a character (of a file name that is no text) cannot be written at all. Every
+    text for a person goes through this on its way out.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        letter if letter.isprintable() or letter == "\n" else repr(letter)[1:-1] for letter in text
+    )

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 # a cloud that states no CRS may lie this many extents of the registered one away from it
 _FAR = 10.0
+# and one in the same CRS this many, before that is said
+_BESIDE = 1.0
 
 
 def apply_transform(
@@ -52,7 +54,8 @@ def apply_transform(
         inverse: go from target to source.
         overwrite: whether `out_path` may be replaced.
         progress: where to report the points written.
-        say: called with a sentence where points or dimensions were left out.
+        say: called with a sentence where points or dimensions were left out, or the cloud lies far from the
+            one that was registered.
         text: layout of a cloud that is text, see `mtpcr_geo.io.formats.text_layout.TextLayout.read`.
         scale: storage step of a LAS file, in units of its CRS.
 
@@ -72,6 +75,9 @@ def apply_transform(
         if out_path.exists() and read.is_file() and out_path.samefile(read):
             raise InputError(f"{out_path} is input and output at once; write to another file")
     moved = moved_by(chain, cloud, inverse=inverse)
+    far = far_text(chain, cloud, inverse=inverse)
+    if far is not None and say is not None:
+        say(far)
     said = write_moved(
         out_path, moved, overwrite=overwrite, reads=(in_path, transform_path), progress=progress, scale=scale
     )
@@ -135,8 +141,40 @@ def _check_near(chain: TransformChain, cloud: Cloud, inverse: bool) -> None:
         CrsError: if it is farther away than many times the extent of that one.
 
     """
-    if cloud.crs is not None or not cloud.count:
+    if cloud.crs is not None:
         return
+    away = _extents_away(chain, cloud, inverse)
+    if away is not None and away > _FAR:
+        side = "target" if inverse else "source"
+        raise CrsError(
+            f"{cloud.name} states no CRS and lies {away:.3g} times the extent of the {side} away from it, so "
+            "it is hardly in its frame; state its CRS in the file, or check whether --inverse is meant"
+        )
+
+
+def far_text(chain: TransformChain, cloud: Cloud, *, inverse: bool = False) -> str | None:
+    """Say that a cloud lies outside the place where the transform was found; None if it does not.
+
+    Args:
+        chain: from the source's coordinates to the target's.
+        cloud: what is moved.
+        inverse: go from target to source.
+
+    """
+    away = _extents_away(chain, cloud, inverse)
+    if away is None or away <= _BESIDE:
+        return None
+    side = "target" if inverse else "source"
+    return (
+        f"{Path(cloud.name).name} lies {away:.3g} times the extent of the {side} away from it: the transform "
+        "was found there and nowhere else, and an error of its rotation grows with the distance"
+    )
+
+
+def _extents_away(chain: TransformChain, cloud: Cloud, inverse: bool) -> float | None:
+    """Return how far a cloud lies from where the registered one lay, in extents of that one; None unknown."""
+    if not cloud.count:
+        return None
     box = chain.bounds
     if inverse:
         corners = np.array(
@@ -147,16 +185,10 @@ def _check_near(chain: TransformChain, cloud: Cloud, inverse: bool) -> None:
     # in the plane: heights of one place differ by their datum
     low, high = cloud.minimum[:2], cloud.maximum[:2]
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        return
+        return None
     gap = float(np.hypot(*np.maximum(np.maximum(box[0, :2] - high, low - box[1, :2]), 0.0)))
     extent = float(np.hypot(*(box[1, :2] - box[0, :2])))
-    if gap > _FAR * max(extent, np.finfo(float).tiny):
-        side = "target" if inverse else "source"
-        raise CrsError(
-            f"{cloud.name} states no CRS and lies {gap / extent if extent else gap:.3g} times the extent of "
-            f"the {side} away from it, so it is hardly in its frame; state its CRS in the file, or check "
-            "whether --inverse is meant"
-        )
+    return gap / max(extent, np.finfo(float).tiny)
 
 
 def paths_of(cloud: Cloud) -> list[Path]:

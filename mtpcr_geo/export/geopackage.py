@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import OutputError
+from mtpcr_geo.core.wording import visible
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -148,7 +149,7 @@ def _add_srs(base: sqlite3.Connection, crs: CRS | None) -> int:
             srs = code
         else:
             organization, code, srs = "NONE", _OWN_SRS, _OWN_SRS
-        rows.append((crs.name, srs, organization, code, _definition(crs), ""))
+        rows.append((visible(crs.name), srs, organization, code, visible(_definition(crs)), ""))
     base.executemany("INSERT OR IGNORE INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?)", rows)
     return srs
 
@@ -193,7 +194,7 @@ def _add_layer(base: sqlite3.Connection, layer: Layer, srs: int) -> None:
             "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, "
             "styleName, styleQML, useAsDefault, description, update_time) "
             "VALUES ('', '', ?, 'geom', ?, ?, 1, ?, ?)",
-            (layer.name, layer.name, layer.style, layer.description, _now()),
+            (layer.name, layer.name, layer.style, visible(layer.description), _now()),
         )
 
 
@@ -207,7 +208,7 @@ def _register(
 ) -> None:
     base.execute(
         "INSERT INTO gpkg_contents VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        (name, data_type, name, description, _now(), *(bounds or (None,) * 4), srs),
+        (name, data_type, name, visible(description), _now(), *(bounds or (None,) * 4), srs),
     )
 
 
@@ -223,4 +224,5 @@ def _sql_type(values: NDArray[Any]) -> str:
 def _plain(values: NDArray[Any]) -> list[Any]:
     """Return values as SQLite takes them; SQLite itself stores NaN as NULL."""
     values = np.asarray(values)
-    return list((values.astype(np.int64) if values.dtype.kind == "b" else values).tolist())
+    plain = (values.astype(np.int64) if values.dtype.kind == "b" else values).tolist()
+    return [visible(value) if isinstance(value, str) else value for value in plain]

@@ -17,6 +17,7 @@ from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Pair, Side
 from mtpcr_geo.core.version import __version__
+from mtpcr_geo.core.wording import visible
 from mtpcr_geo.crs import WorkFrame
 from mtpcr_geo.export import overviews
 
@@ -113,7 +114,7 @@ def write_bev(
 
 
 def _fill(out: Any, bands: Sequence[Image], tags: Mapping[str, str]) -> None:
-    out.update_tags(**tags)
+    out.update_tags(**{key: visible(text) for key, text in tags.items()})
     for index, (band, (text, unit)) in enumerate(zip(bands, BANDS, strict=True), start=1):
         out.set_band_description(index, text)
         out.set_band_unit(index, unit)

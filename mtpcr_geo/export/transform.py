@@ -17,6 +17,7 @@ from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.core.frames import FrameLink, OperationReport, Vertical
 from mtpcr_geo.core.scanner import Scanner
 from mtpcr_geo.core.units import Axes, Unit
+from mtpcr_geo.core.wording import visible
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.crs.facts import facts_of
 from mtpcr_geo.export.uncertainty_facts import calibrated, uncertainty_facts
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 KIND, VERSION, TURNED = "mtpcr-geo transform", 1, 2
 _SHARED_SHIFT = 10_000.0  # beyond this, single precision would show in one common shift
 _EARTH_RADIUS = 6_371_000.0
+_RIGID = 1e-6
 
 
 def write_transform_json(path: str | Path, pair: Pair, *, forced: bool = False) -> None:
@@ -112,7 +114,7 @@ def write_cloudcompare_matrix(path: str | Path, pair: Pair) -> None:
     for role in ("source", "target"):
         shift = " ".join(f"{value + 0.0:.17g}" for value in found[f"{role}_global_shift"])
         rows.append(f"# {role} global shift: {shift}")
-    Path(path).write_text("\n".join([*rows, f"# {found['note']}"]) + "\n", encoding="utf-8")
+    Path(path).write_text(visible("\n".join([*rows, f"# {found['note']}"])) + "\n", encoding="utf-8")
 
 
 def read_transform(path: str | Path) -> TransformChain:
@@ -147,11 +149,26 @@ def read_transform(path: str | Path) -> TransformChain:
             pivot=_array(document["pivot"]["source"], (3,)),
             bounds=_array(chain["source_bounds"], (2, 3)),
         )
+        _check_rigid(result.T_target_source)
     except (KeyError, TypeError, ValueError, OverflowError, IndexError) as error:
         raise InputError(
             f"{path} is damaged ({type(error).__name__}: {error}); register again to write a new one"
         ) from error
     return result
+
+
+def _check_rigid(T: Floats) -> None:
+    """Refuse a 4x4 that no registration gives.
+
+    Raises:
+        ValueError: if it mirrors, stretches or is not finite.
+
+    """
+    R = T[:3, :3]
+    with np.errstate(all="ignore"):
+        rigid = np.allclose(R @ R.T, np.eye(3), rtol=0, atol=_RIGID) and np.linalg.det(R) > 0
+    if not (np.isfinite(T).all() and rigid and (T[3] == [0, 0, 0, 1]).all()):
+        raise ValueError("T_target_source is no rigid transform")
 
 
 def doubts_of(path: str | Path) -> str | None:

@@ -163,9 +163,11 @@ class LasCloud(Cloud):
 def xyz_of(record: Any) -> Floats:
     """Return the (n, 3) float64 coordinates of a laspy point record."""
     xyz = np.empty((len(record), 3))
-    for axis, name in enumerate("XYZ"):
-        np.multiply(record.array[name], record.scales[axis], out=xyz[:, axis])
-        xyz[:, axis] += record.offsets[axis]
+    # scales and offsets of a broken header give what is not finite, which whoever takes the points refuses
+    with np.errstate(all="ignore"):
+        for axis, name in enumerate("XYZ"):
+            np.multiply(record.array[name], record.scales[axis], out=xyz[:, axis])
+            xyz[:, axis] += record.offsets[axis]
     return xyz
 
 
@@ -177,7 +179,7 @@ def open_cloud(path: str | Path, crs: CRS | None = None) -> LasCloud:
         crs: coordinate reference system to take instead of what the file states.
 
     Raises:
-        InputError: if it is missing, unreadable, or not such a file.
+        InputError: if it is missing, unreadable, or not such a file, or has an axis turned round.
 
     """
     path = Path(path)
@@ -189,6 +191,12 @@ def open_cloud(path: str | Path, crs: CRS | None = None) -> LasCloud:
         if stream.read(4) != b"LASF":
             raise InputError(f"{path} is not a LAS, LAZ or COPC file (it does not begin with LASF)")
         head = Head(stream)
+    if (np.asarray(head.header.scales) < 0).any():
+        axis = "xyz"[int(np.argmin(head.header.scales))]
+        raise InputError(
+            f"{path} has a negative scale in {axis}, so that it may be mirrored; export it again with scales "
+            "above zero"
+        )
     return LasCloud(path, head, crs)
 
 

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 BUDGET = 4_000_000
 FEWEST_POINTS = 100
+# a double still tells an eighth of a unit apart there, and the Moon is nearer in millimetres
+_LARGEST_COORDINATE = 1e15
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,15 +260,19 @@ class _Subset:
 
 
 def _check_finite(cloud: Cloud, xyz: Floats, before: int) -> None:
-    if np.isfinite(xyz.sum()):
+    # a NaN makes both comparisons false
+    if not len(xyz) or (xyz.min() >= -_LARGEST_COORDINATE and xyz.max() <= _LARGEST_COORDINATE):
         return
     bad = ~np.isfinite(xyz).all(axis=1)
-    if bad.any():
-        first = before + int(bad.argmax())
-        raise InputError(
-            f"{cloud.name} has coordinates that are not finite (first at point {first}); "
-            "remove those points, or check the header's scales and offsets"
-        )
+    what = "that are not finite"
+    if not bad.any():
+        bad = (np.abs(xyz) > _LARGEST_COORDINATE).any(axis=1)
+        what = f"beyond {_LARGEST_COORDINATE:g}, which is no place in any unit"
+    first = before + int(bad.argmax())
+    raise InputError(
+        f"{cloud.name} has coordinates {what} (first at point {first}); "
+        "remove those points, or check the header's scales and offsets"
+    )
 
 
 def _check_usable(

@@ -52,32 +52,34 @@ def settled(cloud: Cloud, move: Move | None, scales: Floats, coarsest: Floats | 
         InputError: if the cloud cannot be read.
 
     """
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    looked = []
-    for xyz in cloud.xyz_chunks():
-        moved = xyz if move is None else move(xyz)
-        low, high = np.minimum(low, moved.min(axis=0)), np.maximum(high, moved.max(axis=0))
-        looked.append(moved[:: max(1, len(moved) // _LOOKED_AT)])
-    some = np.concatenate(looked)
-    middle, half = np.rint((low + high) / 2), (high - low) / 2 + 1.0
-    grown = scales.copy()
-    while coarsest is not None and ((half / grown > MOST_STEPS) & (grown < coarsest)).any():
-        # each axis by itself: a wide plan shall not cost the heights their digits
-        coarser = np.minimum(grown * 10, np.maximum(coarsest, scales))
-        grown = np.where(half / grown > MOST_STEPS, coarser, grown)
-    if (half / grown <= MOST_STEPS).all():
-        return Storage(grown, middle)
-    # beams without a return lie at one place, however many they are
-    places = np.unique(some, axis=0)
-    # the finer scale again: a few points far away shall not cost the others their digits
-    for wanted in (scales, grown):
-        offsets = np.rint(np.median(places, axis=0))
-        misfit = (np.abs(places - offsets) / wanted > MOST_STEPS).any(axis=1)
-        if misfit.mean() <= FEW_SHARE:
-            return Storage(wanted, offsets)
-    distance = float(np.abs(places - offsets).max())
+    # coordinates of a broken file may be of any size
+    with np.errstate(over="ignore", invalid="ignore"):
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        looked = []
+        for xyz in cloud.xyz_chunks():
+            moved = xyz if move is None else move(xyz)
+            low, high = np.minimum(low, moved.min(axis=0)), np.maximum(high, moved.max(axis=0))
+            looked.append(moved[:: max(1, len(moved) // _LOOKED_AT)])
+        some = np.concatenate(looked)
+        middle, half = np.rint((low + high) / 2), (high - low) / 2 + 1.0
+        grown = scales.copy()
+        while coarsest is not None and ((half / grown > MOST_STEPS) & (grown < coarsest)).any():
+            # each axis by itself: a wide plan shall not cost the heights their digits
+            coarser = np.minimum(grown * 10, np.maximum(coarsest, scales))
+            grown = np.where(half / grown > MOST_STEPS, coarser, grown)
+        if (half / grown <= MOST_STEPS).all():
+            return Storage(grown, middle)
+        # beams without a return lie at one place, however many they are
+        places = np.unique(some, axis=0)
+        # the finer scale again: a few points far away shall not cost the others their digits
+        for wanted in (scales, grown):
+            offsets = np.rint(np.median(places, axis=0))
+            misfit = (np.abs(places - offsets) / wanted > MOST_STEPS).any(axis=1)
+            if misfit.mean() <= FEW_SHARE:
+                return Storage(wanted, offsets)
+        distance = float(np.abs(places - offsets).max())
     raise OutputError(
-        f"{misfit.mean():.0%} of the points, up to {distance:.0f} from the others, do not fit a LAS file at "
+        f"{misfit.mean():.0%} of the points, up to {distance:.6g} from the others, do not fit a LAS file at "
         f"scale {grown.min():g}; give a coarser one (--scale; scale_x ... of writers.las in a pipeline), or "
         "take them apart"
     )

@@ -160,22 +160,27 @@ class Moved(Cloud):
             low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
         return low, high
 
+    def _moved(self, xyz: Floats) -> Floats:
+        # points of a broken file may lie anywhere; whoever takes them refuses what is not finite
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self.move(xyz)
+
     def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
         """Yield (n, 3) float64 moved coordinates, n <= size."""
         for xyz in self.base.xyz_chunks(size):
-            yield self.move(xyz)
+            yield self._moved(xyz)
 
     def table_chunks(self, size: int = CHUNK_POINTS) -> Iterator[PointTable]:
         """Yield tables of all dimensions by PDAL name, n <= size rows each."""
         for table in self.base.table_chunks(size):
-            xyz = self.move(xyz_of(table))
+            xyz = self._moved(xyz_of(table))
             moved: PointTable = {axis: xyz[:, i] for i, axis in enumerate("XYZ")}
             yield {**table, **moved}
 
     def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, NDArray[np.bool_]]]:
         """Yield moved coordinates (n, 3) and which of them are noise or withheld (n,), n <= size."""
         for xyz, noise in self.base.noise_chunks(size):
-            yield self.move(xyz), noise
+            yield self._moved(xyz), noise
 
 
 def moved_source(pair: Pair) -> Moved:

@@ -143,12 +143,14 @@ def returning_scales(cloud: Cloud, crs: CRS | None) -> Floats:
         if cloud.crs is not None and cloud.crs.is_geographic:
             scales[:2] *= _METRES_A_DEGREE
         scales = np.clip(scales, FINEST_STEP / 10, STEP)
-    extent = cloud.maximum - cloud.minimum
-    if cloud.crs is None or not cloud.crs.is_geographic:
-        # from the middle to the sides; what a turn or a tilt adds is for `settled`
-        half = 0.5 * np.array([*(extent[:2].max(),) * 2, extent[2]])
-        while np.isfinite(half).all() and ((scales < STEP) & (half / scales > MOST_STEPS)).any():
-            scales = np.where(half / scales > MOST_STEPS, np.minimum(scales * 10, STEP), scales)
+    # headers may state bounds of any size
+    with np.errstate(over="ignore"):
+        extent = cloud.maximum - cloud.minimum
+        if cloud.crs is None or not cloud.crs.is_geographic:
+            # from the middle to the sides; what a turn or a tilt adds is for `settled`
+            half = 0.5 * np.array([*(extent[:2].max(),) * 2, extent[2]])
+            while np.isfinite(half).all() and ((scales < STEP) & (half / scales > MOST_STEPS)).any():
+                scales = np.where(half / scales > MOST_STEPS, np.minimum(scales * 10, STEP), scales)
     if crs is not None and crs.is_geographic:
         scales[:2] = np.minimum(scales[:2] / _METRES_A_DEGREE, DEGREE_STEP)
     return scales
@@ -230,11 +232,13 @@ def _placed(
     header.scales = storage.scales
     offsets = storage.offsets
     for xyz, packed in chunks:
-        moved = xyz if move is None else move(xyz)
-        if offsets is None:
-            offsets = np.rint((moved.min(axis=0) + moved.max(axis=0)) / 2)
-        header.offsets = offsets
-        steps = np.rint((moved - offsets) / storage.scales)
+        # of a broken file a point may lie anywhere; what does not fit is found below
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved = xyz if move is None else move(xyz)
+            if offsets is None:
+                offsets = np.rint((moved.min(axis=0) + moved.max(axis=0)) / 2)
+            header.offsets = offsets
+            steps = np.rint((moved - offsets) / storage.scales)
         worst = float(np.abs(steps).max())
         kept = packed
         if not worst <= MOST_STEPS:

@@ -196,7 +196,11 @@ def link(elements: Sequence[Element]) -> list[StageSpec]:
 
 def dump(stages: Sequence[Mapping[str, Any]]) -> str:
     """Write stages as the JSON that `parse` reads."""
-    return json.dumps({"pipeline": list(stages)}, indent=2, ensure_ascii=False)
+    text = json.dumps({"pipeline": list(stages)}, indent=2, ensure_ascii=False)
+    # what a terminal would obey, or could not show, in JSON's own escapes
+    return "".join(
+        letter if letter.isprintable() or letter == "\n" else json.dumps(letter)[1:-1] for letter in text
+    )
 
 
 def _load(text: str | bytes, where: str) -> Any:

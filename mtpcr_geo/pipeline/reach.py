@@ -22,6 +22,7 @@ _CONNECTION = re.compile(r"\s*(<|[A-Za-z][A-Za-z0-9_]+:(?!//))")
 _IN_QUERY = re.compile(r"[\"'`\[]\s*[A-Za-z][A-Za-z0-9_]+:")
 _BY_GDAL = frozenset({"raster", "datasource", "ramp", "ogr"})
 _FILES = _BY_GDAL | {"filename", "path", "addons"}
+_GDAL_STAGES = frozenset({"readers.gdal", "writers.gdal", "writers.raster", "writers.ogr"})
 _QUERIES = frozenset({"query", "sql", "layer"})
 
 _NAMESPACE = re.compile(r"\sxmlns(:[\w.-]+)?\s*=\s*(\"[^\"]*\"|'[^']*')")
@@ -43,7 +44,7 @@ def check(spec: StageSpec) -> None:
 
     """
     for name, text in _texts(spec.options):
-        if _reaches_out(name, text):
+        if _reaches_out(name, text, by_gdal=name in _BY_GDAL or spec.type in _GDAL_STAGES):
             raise OptionError(
                 f"{spec.label}: option {name!r} names something remote or virtual, {text[:60]!r}; "
                 "say --allow-network to let it"
@@ -58,12 +59,13 @@ def check(spec: StageSpec) -> None:
                 )
 
 
-def _reaches_out(name: str, text: str) -> bool:
+def _reaches_out(name: str, text: str, *, by_gdal: bool) -> bool:
+    """Return whether a text names what is not here; to PDAL itself a colon in a file's name is none."""
     if _REMOTE.search(text) or _VIRTUAL.search(text):
         return True
     if name in _QUERIES and _IN_QUERY.search(text):
         return True
-    return name in _FILES and _CONNECTION.match(text) is not None
+    return by_gdal and name in _FILES and _CONNECTION.match(text) is not None
 
 
 def _texts(options: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[str, str]]:
@@ -120,7 +122,7 @@ def _named_by(path: Path, seen: set[Path]) -> tuple[Path, str] | None:
     if text.startswith(("{", "[")):
         remote = re.search(r"\"(href|url|uri|ogr|path|filename)\"\s*:\s*\"([^\"]*)\"", text)
         what = remote.group(2).replace("\\/", "/") if remote else ""
-        return (path, what) if what and _reaches_out("filename", what) else None
+        return (path, what) if what and _reaches_out("filename", what, by_gdal=True) else None
     return None
 
 
@@ -135,7 +137,7 @@ def _named_by_xml(path: Path, text: str, seen: set[Path]) -> tuple[Path, str] | 
         return path, rest[remote.start() : remote.start() + 60]
     for match in _NAMED.finditer(rest):
         named = match.group(2)
-        if _reaches_out("filename", named):
+        if _reaches_out("filename", named, by_gdal=True):
             return path, named
         for place in (path.parent / named, Path(named)):
             found = _named_by(place, seen)

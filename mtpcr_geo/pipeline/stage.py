@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -64,6 +65,7 @@ class RunContext:
         facts: what holds for the whole run.
         failure: why the registration has nothing to go on with, once a stage said so.
         spool: temporary files of clouds that were handed to PDAL.
+        at_end: what else is to be closed when the run ends.
 
     """
 
@@ -74,6 +76,7 @@ class RunContext:
     facts: RunFacts = field(default_factory=RunFacts)
     failure: str | None = None
     spool: Spool = field(default_factory=Spool)
+    at_end: ExitStack = field(default_factory=ExitStack)
     _scratch: tempfile.TemporaryDirectory[str] | None = None
 
     def scratch(self) -> Path:
@@ -84,6 +87,7 @@ class RunContext:
 
     def close(self) -> None:
         """Remove temporary files, and finish the recording."""
+        self.at_end.close()
         if self._scratch is not None:
             self._scratch.cleanup()
             self._scratch = None

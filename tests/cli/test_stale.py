@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -56,3 +57,58 @@ def test_a_refused_run_removes_what_an_accepted_one_left(verb, town_files, unrel
     assert json.loads(Path("out/run.json").read_text())["verdict"] == "refused"
     if verb == "register":
         assert "audit.rrd" not in left
+
+
+# what makes a run of the town end so, by what the pipeline's options say, and its exit code
+OUTCOMES: dict[str, tuple[list[str], int]] = {
+    "accepted": ([], 0),
+    "doubtful": (["--assess.null_ratio=1000"], 3),
+    "refused": (["UNRELATED"], 4),
+    "forced": (["UNRELATED", "--force"], 4),
+}
+
+
+def names(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def command_for(verb: str, outcome: str, town_files, unrelated: Path) -> tuple[list[str], int]:
+    """Return the command of a verb that ends so in the current folder, into "out"."""
+    options, code = OUTCOMES[outcome]
+    source = unrelated if "UNRELATED" in options else town_files[0]
+    words = [option for option in options if option == "--force"]
+    register = ["register", str(source), str(town_files[1]), "-o", "out", "--no-recording", *words]
+    if verb == "register":
+        return register, code
+    dumped = CliRunner().invoke(app, [*register, "--dump-pipeline"])
+    Path(f"{outcome}.json").write_text(dumped.stdout)
+    return ["pipeline", f"{outcome}.json", *(one for one in options if one.startswith("--assess"))], code
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", ["register", "pipeline"])
+def test_every_pair_of_verdicts(verb, town_files, unrelated, tmp_path, monkeypatch):
+    """Whatever stood there, a run with --overwrite leaves the set that it leaves in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    # register has no option that makes the town doubtful
+    outcomes = [name for name in OUTCOMES if verb == "pipeline" or name != "doubtful"]
+    commands = {name: command_for(verb, name, town_files, unrelated) for name in outcomes}
+    for name, (command, code) in commands.items():
+        assert invoke(*command) == code, name
+        Path("out").rename(f"fresh-{name}")
+        said = json.loads(Path(f"fresh-{name}/run.json").read_text())["verdict"]
+        assert said == ("refused" if name == "forced" else name)
+    withheld = {"registered.laz", "transform.json"}
+    assert names(Path("fresh-accepted")) >= withheld
+    assert names(Path("fresh-forced")) >= withheld
+    assert names(Path("fresh-refused")).isdisjoint(withheld)
+    for first in outcomes:
+        for second, (command, code) in commands.items():
+            shutil.rmtree("out", ignore_errors=True)
+            shutil.copytree(f"fresh-{first}", "out")
+            Path("out/notes.txt").write_text("mine")
+            assert invoke(*command, "--overwrite") == code, (first, second)
+            assert names(Path("out")) == names(Path(f"fresh-{second}")) | {"notes.txt"}, (first, second)
+            for path in names(Path("out")) & {"transform.cloudcompare.txt", "bev/target.tif"}:
+                new, fresh = Path("out", path), Path(f"fresh-{second}", path)
+                assert new.read_bytes() == fresh.read_bytes(), (first, second, path)

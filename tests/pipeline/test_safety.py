@@ -20,7 +20,7 @@ from mtpcr_geo.core.errors import MtpcrError, OptionError, OutputError
 from mtpcr_geo.pipeline.grammar import link, parse
 from mtpcr_geo.pipeline.pdal import bindings
 from mtpcr_geo.pipeline.pdal.allowed import ALLOWED
-from mtpcr_geo.pipeline.pdal.switches import Access, held_to
+from mtpcr_geo.pipeline.pdal.switches import Access, environment
 from mtpcr_geo.pipeline.safety import check
 
 READER = {"type": "readers.las", "filename": "target.laz"}
@@ -130,14 +130,14 @@ def test_writers_of_several_files_are_refused():
         refuse({"type": "writers.ept_addon", "addons": {}}, access=Access(code=True))
 
 
-def test_the_switches_are_put_back(monkeypatch):
+def test_the_switches_are_those_of_the_process_alone(monkeypatch):
     monkeypatch.setenv("http_proxy", "http://mine")
-    monkeypatch.delenv("GDAL_VRT_ENABLE_PYTHON", raising=False)
-    with held_to(Access()), held_to(Access(network=True)):
-        assert os.environ["http_proxy"] != "http://mine"
-        assert os.environ["GDAL_VRT_ENABLE_PYTHON"] == "NO"
+    closed, network = environment(Access()), environment(Access(network=True))
+    assert closed["http_proxy"] != "http://mine"
+    assert network["http_proxy"] == "http://mine"
+    assert closed["GDAL_VRT_ENABLE_PYTHON"] == network["GDAL_VRT_ENABLE_PYTHON"] == "NO"
     assert os.environ["http_proxy"] == "http://mine"
-    assert "GDAL_VRT_ENABLE_PYTHON" not in os.environ
+    assert "GDAL_VRT_ENABLE_PYTHON" not in environment(Access(code=True, network=True))
 
 
 class Listening(socketserver.BaseRequestHandler):

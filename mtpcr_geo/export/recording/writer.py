@@ -15,6 +15,7 @@ from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.types import Pair, Side
 from mtpcr_geo.core.version import __version__
+from mtpcr_geo.core.wording import visible
 from mtpcr_geo.export import descriptions, drawing
 from mtpcr_geo.export.recording import matching
 from mtpcr_geo.export.recording.layout import TIMELINE, Recorded, layout
@@ -86,7 +87,7 @@ class RecordingWriter:
         bad = "verdict" in made and "accepted" not in made
         level = rr.TextLogLevel.WARN if bad else rr.TextLogLevel.INFO
         line = f"{tag} ({stage_type}), {seconds:.2f} s: {made}"
-        self._log("stages", rr.TextLog(line, level=level))
+        self._log("stages", rr.TextLog(visible(line), level=level))
         self._log("seconds", rr.Scalars(seconds))
         self._log("summary", self._markdown(self._summary()))
         self._stage += 1
@@ -131,7 +132,7 @@ class RecordingWriter:
 
     def _log_frame(self, pair: Pair, sides: list[Side]) -> None:
         names = [Path(side.cloud.name).name for side in sides]
-        self._stream.send_recording_name(" to ".join(names))
+        self._stream.send_recording_name(visible(" to ".join(names)))
         crs = pair.frame.crs
         frame = {
             "crs": crs.name if crs is not None else "local",
@@ -308,14 +309,16 @@ class RecordingWriter:
         return xyz[((np.arange(budget) + jitter) * (len(xyz) / budget)).astype(np.int64)]
 
     def _send_properties(self, name: str, values: Mapping[str, Any]) -> None:
-        texts = {str(key).replace("-", "_"): descriptions.plain(value) for key, value in values.items()}
-        texts = {key: text for key, text in texts.items() if text}
+        texts = {
+            visible(str(key)).replace("-", "_"): descriptions.plain(value) for key, value in values.items()
+        }
+        texts = {key: visible(text) for key, text in texts.items() if text}
         if texts:
-            self._stream.send_property(name.replace("-", "_"), rr.AnyValues(**texts))
+            self._stream.send_property(visible(name).replace("-", "_"), rr.AnyValues(**texts))
 
     @staticmethod
     def _markdown(text: str) -> Any:
-        return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+        return rr.TextDocument(visible(text), media_type=rr.MediaType.MARKDOWN)
 
     def _summary(self) -> str:
         pair = self._pair

@@ -11,6 +11,7 @@ from typing import Any
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.core.version import __version__
+from mtpcr_geo.core.wording import visible
 from mtpcr_geo.crs import TransformChain
 from mtpcr_geo.export import charts, descriptions, drawing
 from mtpcr_geo.export.report import certainty
@@ -83,7 +84,7 @@ def write_report(
         f"{''.join(sections)}</main></body></html>\n"
     )
     try:
-        Path(path).write_text(html, encoding="utf-8")
+        Path(path).write_text(visible(html), encoding="utf-8")
     except OSError as error:
         raise OutputError(f"cannot write the report {path}: {error.strerror}") from error
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from tokenize import TokenError
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -52,5 +53,9 @@ def open_file(path: Path, crs: CRS | None) -> NumpyCloud:
 
 
 def _mapped(path: Path) -> NDArray[Any]:
-    array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+    try:
+        array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (SyntaxError, TokenError, RecursionError, MemoryError, OverflowError) as error:
+        # numpy reads the header as Python would
+        raise ValueError(f"its header cannot be read: {type(error).__name__}") from error
     return array

@@ -27,7 +27,8 @@ class PtxCloud(FileCloud):
         with self.path.open("rb") as stream:
             for number, (count, T) in enumerate(_scans(stream), 1):
                 for rows in rows_of(stream, size, most=count):
-                    xyz = rows[:, :3] @ T[:3, :3] + T[3, :3]
+                    with np.errstate(over="ignore", invalid="ignore"):
+                        xyz = rows[:, :3] @ T[:3, :3] + T[3, :3]
                     columns = {axis: xyz[:, i] for i, axis in enumerate("xyz")}
                     if rows.shape[1] > 3:
                         columns["intensity"] = rows[:, 3]
@@ -67,4 +68,6 @@ def _scans(stream: BinaryIO) -> Iterator[tuple[int, Floats]]:
         T = np.array(head[4:], np.float64)
         if T.shape != (4, 4):
             raise ValueError("the 4x4 of a scan is none")
+        if not (np.isfinite(T).all() and np.linalg.det(T[:3, :3]) > 0):
+            raise ValueError("the 4x4 of a scan mirrors it, or is no transform")
         yield columns * rows, T

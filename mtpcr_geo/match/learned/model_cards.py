@@ -10,16 +10,29 @@ import os
 import tomllib
 from collections.abc import Iterator
 from importlib import resources
-from pathlib import Path
+from pathlib import Path, PurePath, PureWindowsPath
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from mtpcr_geo.core.errors import MissingPartError, OptionError
 from mtpcr_geo.core.system import sha256
 
 VARIABLE = "MTPCR_GEO_MODELS"
 _LONGEST, _MOST_DOTS = 20_000, 200
+_LONGEST_NAME = 200
+
+
+def _within(name: str) -> str:
+    """Take the name of a file in the models folder; raise ValueError for one that leads elsewhere."""
+    if not name.isprintable() or len(name.encode()) > _LONGEST_NAME or name != PurePath(name).name:
+        raise ValueError(f"{name[:60]!r} is no plain name of a file in the models folder")
+    if "\\" in name or PureWindowsPath(name).drive:
+        raise ValueError(f"{name[:60]!r} is no plain name of a file in the models folder")
+    return name
+
+
+FileName = Annotated[str, AfterValidator(_within)]
 
 
 class _Part(BaseModel):
@@ -29,7 +42,7 @@ class _Part(BaseModel):
 class ExtractorFile(_Part):
     """A graph that finds keypoints in one image."""
 
-    file: str = Field(description="ONNX file in the models folder")
+    file: FileName = Field(description="ONNX file in the models folder")
     size_multiple: int = Field(32, ge=1, description="height and width are padded to multiples of this")
     score_threshold: float = Field(0.0, description="keypoints that score no more are padding, and dropped")
     descriptor_dim: int = Field(ge=1, description="length of a descriptor")
@@ -50,7 +63,7 @@ class ExtractorFile(_Part):
 class MatcherFile(_Part):
     """A graph that pairs the keypoints of two images."""
 
-    file: str = Field(description="ONNX file in the models folder")
+    file: FileName = Field(description="ONNX file in the models folder")
     score_threshold: float = Field(0.1, description="pairs that score no more are dropped")
     sweep_keypoints: int = Field(
         2048,
@@ -74,7 +87,7 @@ class NearestFile(_Part):
 class FusedFile(_Part):
     """A graph that takes both images and gives pairs of keypoints."""
 
-    file: str = Field(description="ONNX file in the models folder")
+    file: FileName = Field(description="ONNX file in the models folder")
     size_multiple: int = Field(8, ge=1, description="height and width are padded to multiples of this")
     score_threshold: float = Field(0.1, description="pairs that score no more are dropped")
     tile: int = Field(1024, ge=64, description="longest edge fed; larger images are shrunk to it")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,9 +16,11 @@ from mtpcr_geo.io.dimensions import separate_legacy_flags
 from mtpcr_geo.io.las import LasCloud
 from mtpcr_geo.io.views import Moved, xyz_of
 from mtpcr_geo.io.write import write_cloud
-from mtpcr_geo.pipeline.pdal import bindings
+from mtpcr_geo.pipeline.pdal import bindings, process
+from mtpcr_geo.pipeline.pdal.process import PdalCrashError, PdalError
 from mtpcr_geo.pipeline.pdal.step import (
     Step,
+    crash,
     failure,
     file_written,
     is_reader,
@@ -26,7 +28,7 @@ from mtpcr_geo.pipeline.pdal.step import (
     numbered_files,
     stage_json,
 )
-from mtpcr_geo.pipeline.pdal.switches import Access, held_to
+from mtpcr_geo.pipeline.pdal.switches import Access
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -37,6 +39,7 @@ Records = NDArray[np.void]
 
 # chunks of a streamed chain are kept up to this size, so that small clouds run through PDAL once
 _KEEP_BYTES = 256 * 2**20
+_MERGED = {"type": "filters.merge", "tag": "mtpcr_merged"}
 
 
 class PdalCloud(Cloud):
@@ -63,10 +66,8 @@ class PdalCloud(Cloud):
         self._steps = _steps_before(self.step)
         chain = self._chain(context)
         writers = [step for step in self._steps if is_writer(step.spec) and not step.written]
-        pipeline = bindings.pipeline(chain)
         with context.progress.task(f"PDAL: {self.step.tag}"):
-            streamed = pipeline.streamable
-            metadata = self._stream_first(pipeline) if streamed else self._execute(chain, need_crs)
+            metadata = self._run(chain, need_crs)
         for step in writers:
             step.written = True
             template = numbered_files(step.spec)
@@ -124,37 +125,29 @@ class PdalCloud(Cloud):
             chain[step.tag] = stage_json(step.spec, inputs, **_temporary_filename(step, context))
         return [step.tag]
 
-    def _stream_first(self, pipeline: Any) -> Any:
-        kept: list[Records] | None = []
-        size = 0
-        with _blamed(self._steps):
-            iterator = pipeline.iterator(chunk_size=CHUNK_POINTS, prefetch=1)
-            for records in bindings.arrays_of(iterator):
-                self._note(records)
-                size += records.nbytes
-                if kept is not None and size <= _KEEP_BYTES:
-                    kept.append(records)
-                else:
-                    kept = None
-            metadata = iterator.metadata
-        self._held = kept
-        return metadata
-
-    def _execute(self, chain: Sequence[Mapping[str, Any]], need_crs: bool) -> Any:
+    def _run(self, chain: Sequence[Mapping[str, Any]], need_crs: bool) -> Any:
+        """Run the chain, keep its points as far as they are to be kept, and return PDAL's metadata."""
         from pyproj import CRS
 
         # PDAL tells the CRS of what went into the last stage; and our stages take one cloud
-        last = [{"type": "filters.merge", "tag": "mtpcr_merged"}] if need_crs else []
-        pipeline = bindings.pipeline([*chain, *last])
+        last = [_MERGED] if need_crs else []
+        question = {"do": "run", "stages": chain, "whole": [*chain, *last], "size": CHUNK_POINTS}
+        kept: list[Records] | None = []
+        size, streamed, facts = 0, False, {}
         with _blamed(self._steps):
-            pipeline.execute()
-            self._held = list(pipeline.arrays)
-            wkt = pipeline.srswkt2 if need_crs else ""
-            metadata = pipeline.metadata
-        for records in self._held:
-            self._note(records)
-        self.crs = CRS.from_wkt(wkt) if wkt else None
-        return metadata
+            for answer in process.ask(self._access, **question, crs=need_crs):
+                if isinstance(answer, dict):
+                    streamed, facts = answer.get("streamed", streamed), answer.get("done", {})
+                    continue
+                self._note(answer)
+                size += answer.nbytes
+                if kept is not None and (size <= _KEEP_BYTES or not streamed):
+                    kept.append(answer)
+                else:
+                    kept = None
+        self._held = kept
+        self.crs = CRS.from_wkt(facts["crs"]) if facts.get("crs") else None
+        return facts["metadata"]
 
     def _note(self, records: Records) -> None:
         self.count += len(records)
@@ -164,35 +157,44 @@ class PdalCloud(Cloud):
                 self.maximum[axis] = max(self.maximum[axis], records[name].max())
 
     def _stream(self, chain: Sequence[Mapping[str, Any]], size: int) -> Iterator[Records]:
-        with _blamed(self._steps):
-            iterator = bindings.pipeline(chain).iterator(chunk_size=size, prefetch=1)
-            yield from bindings.arrays_of(iterator)
+        with (
+            _blamed(self._steps),
+            closing(
+                process.ask(self._access, do="run", stages=chain, whole=chain, size=size, crs=False)
+            ) as answers,
+        ):
+            for answer in answers:
+                if not isinstance(answer, dict):
+                    yield answer
 
     def _probed_crs(self) -> CRS | None:
         """Ask for the CRS by a run over one point of each reader."""
         from pyproj import CRS
 
         chain = [{**stage, "count": 1} if "inputs" not in stage else stage for stage in self._again]
-        pipeline = bindings.pipeline([*chain, {"type": "filters.merge", "tag": "mtpcr_merged"}])
         with _blamed(self._steps):
-            pipeline.execute()
-            wkt = pipeline.srswkt2
+            wkt = process.done(self._access, do="execute", stages=[*chain, _MERGED], crs=True)["crs"]
         return CRS.from_wkt(wkt) if wkt else None
+
+    @property
+    def _access(self) -> Access:
+        return self._steps[-1].access if self._steps else Access()
 
 
 @contextmanager
 def _blamed(steps: Sequence[Step]) -> Iterator[None]:
-    """Keep PDAL to what the steps may do, and turn its exceptions into errors that name the stage."""
+    """Turn what PDAL says, or that it crashes, into errors that name the stage."""
     try:
-        with held_to(steps[-1].access if steps else Access()):
-            yield
-    except (RuntimeError, ValueError, TypeError) as error:
+        yield
+    except PdalError as error:
         message = bindings.first_line(error)
         named = [step for step in steps if message.startswith(f"{step.spec.type}:")]
         if len(named) == 1 or len(steps) == 1:
             raise failure((named or list(steps))[0].spec, message) from error
         labels = ", ".join(step.tag for step in named or steps)
         raise InputError(f"one of the stages {labels}: PDAL says: {message}") from error
+    except PdalCrashError as error:
+        raise crash([step.spec for step in steps], error) from error
 
 
 def _steps_before(last: Step) -> list[Step]:

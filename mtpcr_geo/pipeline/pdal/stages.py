@@ -9,12 +9,13 @@ from typing import Any
 from pydantic import ConfigDict
 
 from mtpcr_geo.core.cloud import Cloud
-from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.errors import InputError, OptionError
 from mtpcr_geo.core.suggestions import meant
 from mtpcr_geo.pipeline.grammar import StageSpec, file_of
-from mtpcr_geo.pipeline.pdal import bindings
+from mtpcr_geo.pipeline.pdal import bindings, process
 from mtpcr_geo.pipeline.pdal.cloud import PdalCloud
-from mtpcr_geo.pipeline.pdal.step import Step, failure, file_written, is_reader, stage_json
+from mtpcr_geo.pipeline.pdal.process import PdalCrashError
+from mtpcr_geo.pipeline.pdal.step import Step, crash, failure, file_written, is_reader, stage_json
 from mtpcr_geo.pipeline.pdal.switches import Access
 from mtpcr_geo.pipeline.stage import RunContext, Stage, StageOptions, Value
 
@@ -62,9 +63,18 @@ class PdalStage(Stage):
 
     def check(self, context: RunContext) -> None:
         """Let PDAL prepare everything up to this stage, without running it."""
+        for path in self.reads():
+            if path.is_dir():
+                hint = "; name the ept.json in it" if self.spec.type == "readers.ept" else "; name a file"
+                raise InputError(f"{self.label}: {path} is a folder{hint}")
         chain: dict[str, dict[str, Any]] = {}
         guessed = self._prepared(chain)
-        problem = bindings.problem_of(list(chain.values()), self.access)
+        # processes of PDAL's wait for the next stage as long as the run
+        context.at_end.callback(process.end_waiting)
+        try:
+            problem = bindings.problem_of(list(chain.values()), self.access)
+        except PdalCrashError as error:
+            raise crash([self.spec], error) from error
         # without the true cloud, PDAL cannot know which dimensions there will be
         if problem and not (guessed and "dimension" in problem.lower()):
             raise failure(self.spec, problem, preparing=True)

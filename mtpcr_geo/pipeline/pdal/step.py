@@ -91,3 +91,18 @@ def failure(spec: StageSpec, message: str, *, preparing: bool = False) -> MtpcrE
     if "argument" in detail or (preparing and not is_reader(spec)):
         return OptionError(text)
     return OutputError(text) if is_writer(spec) else InputError(text)
+
+
+def crash(specs: Sequence[StageSpec], how: Exception) -> InputError:
+    """Return the error for a crash of PDAL.
+
+    Args:
+        specs: the stages that it ran.
+        how: how its process ended.
+
+    """
+    tags = ", ".join(spec.tag for spec in specs)
+    one = specs[0].label if len(specs) == 1 else f"one of the stages {tags}"
+    return InputError(
+        f"{one}: PDAL crashed ({how}), and nothing of it is kept; look at what its options and its files hold"
+    )

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,57 +45,21 @@ class Access:
         return {**({} if self.code else _NO_CODE), **({} if self.network else _NO_NETWORK)}
 
 
-class _Environment:
-    """The environment as it was before the first holder closed something in it, and who holds it."""
+def environment(access: Access) -> dict[str, str]:
+    """Return the environment for a process of PDAL's: the libraries read there what they may do.
 
-    def __init__(self) -> None:
-        self.before: dict[str, str | None] = {}
-        self.holders = 0
-
-    def hold(self, values: dict[str, str]) -> None:
-        self.holders += 1
-        for name, value in values.items():
-            self.before.setdefault(name, os.environ.get(name))
-            os.environ[name] = value
-
-    def release(self) -> None:
-        self.holders -= 1
-        if self.holders:
-            return
-        for name, value in self.before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-        self.before.clear()
-
-
-_ENVIRONMENT = _Environment()
-
-
-@contextmanager
-def held_to(access: Access) -> Iterator[None]:
-    """Keep the libraries to what is allowed, as long as PDAL works.
-
-    The libraries read environment variables; each is as it was when the last holder is done. While several
-    hold, what one of them closes is closed for all.
+    By itself PDAL loads every ``libpdal_plugin_*`` of the current folder, as soon as it is asked which stages
+    it has: a library that lies beside a pipeline would run. It is let look where it is installed only, unless
+    PDAL_DRIVER_PATH says where.
     """
-    _ENVIRONMENT.hold(access._closed)
-    try:
-        yield
-    finally:
-        _ENVIRONMENT.release()
+    variables = {**os.environ, **access._closed}
+    if not variables.get("PDAL_DRIVER_PATH"):
+        variables["PDAL_DRIVER_PATH"] = _plugins_home()
+    return variables
 
 
-def keep_plugins_home() -> None:
-    """Let PDAL look for plugins where it is installed only, unless PDAL_DRIVER_PATH says where.
-
-    By itself it loads every ``libpdal_plugin_*`` of the current folder, as soon as it is asked which stages
-    it has: a library that lies beside a pipeline would run.
-    """
-    if os.environ.get("PDAL_DRIVER_PATH"):
-        return
+def _plugins_home() -> str:
     prefixes = dict.fromkeys((sys.prefix, sys.base_prefix, os.environ.get("CONDA_PREFIX") or sys.prefix))
     folders = [Path(prefix) / below for prefix in prefixes for below in ("lib", "lib64", "Library/bin")]
     there = [str(folder) for folder in folders if folder.is_dir() and folder.is_absolute()]
-    os.environ["PDAL_DRIVER_PATH"] = os.pathsep.join(there or [str(Path(sys.prefix))])
+    return os.pathsep.join(there or [str(Path(sys.prefix))])
