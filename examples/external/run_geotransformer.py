@@ -9,8 +9,8 @@ takes none, to try the wrapper. The model is made by the experiment's ``create_m
 is given (upstream issues 37, 51, 107 and 116).
 
 Coordinates are divided by the scale, and the translation multiplied by it: weights of 3DMatch know rooms,
-those of KITTI streets (scale 1). The scale is raised where a cloud would have more superpoints than allowed: memory
-grows with their square (12 GiB for 2000, of which each pair has 256 features for each of 3 angles).
+those of KITTI streets (scale 1). The scale is raised where a cloud would have more superpoints than allowed:
+memory grows with their square (12 GiB for 2000, of which each pair has 256 features for each of 3 angles).
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
 
 SOURCE and TARGET are NPY. MapClosures looks for places seen before in a sequence of local maps: ORB features
 of bird's-eye-view point densities, aligned in two dimensions, with a plane of ground for the rest. The source
-is its first map here, and the target a later one that closes a loop. It ends with 1 where it finds no closure,
-by its own threshold.
+is its first map here, and the target a later one that closes a loop. It ends with 1 where it finds none, by
+its own threshold.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
 
 SOURCE and TARGET are NPY. What the command ``sylva fusion-register`` does, by the function that it calls.
 Sylva wants classified ground in both clouds, which its own cloth simulation finds here, and a rough place to
-search around: the middle of the source on that of the target, with a radius that reaches the whole target, and all
-headings. It gives no verdict; its report is printed, and kept with the run.
+search around: the middle of the source on that of the target, with a radius that reaches the whole target,
+and all headings. It gives no verdict; its report is printed, and kept with the run.
 """
 
 from __future__ import annotations
