@@ -20,6 +20,7 @@ class Estimate:
         reason: why it refuses or doubts, or its message.
         details: numbers worth keeping with the run.
         memory_mib: peak memory where the method ran elsewhere; else it is measured around the call.
+        printed: what it printed where it ran elsewhere.
 
     """
 
@@ -28,6 +29,7 @@ class Estimate:
     reason: str = ""
     details: dict[str, Any] = field(default_factory=dict)
     memory_mib: float | None = None
+    printed: str = ""
 
 
 class Method(Protocol):

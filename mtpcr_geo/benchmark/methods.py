@@ -39,7 +39,7 @@ METHODS: dict[str, _Entry] = {
     "fpfh-svd": _Entry(_OPEN3D, "FpfhSvd", ("open3d",)),
     "fpfh-ransac": _Entry(_OPEN3D, "FpfhRansac", ("open3d",)),
     "fpfh-fgr": _Entry(_OPEN3D, "FpfhFgr", ("open3d",)),
-    "fpfh-gnc": _Entry(_KISS, "FpfhGnc", ("open3d", "kiss_matcher")),
+    "fpfh-kiss-solver": _Entry(_KISS, "FpfhKissSolver", ("open3d", "kiss_matcher")),
     "kiss-matcher": _Entry(_KISS, "KissMatcher", ("kiss_matcher",)),
     "fpfh-teaser": _Entry(
         "mtpcr_geo.benchmark.baselines.teaser",
@@ -49,6 +49,7 @@ METHODS: dict[str, _Entry] = {
     ),
     "external": _Entry("mtpcr_geo.benchmark.baselines.external", "External"),
 }
+_RENAMED = {"fpfh-gnc": "fpfh-kiss-solver"}
 
 
 def make_method(spec: str) -> Method:
@@ -62,7 +63,7 @@ def make_method(spec: str) -> Method:
     name = spec.partition(":")[0]
     entry = METHODS.get(name)
     if entry is None:
-        hint = meant(name, list(METHODS)) or f"; choose from {', '.join(METHODS)}"
+        hint = meant(_RENAMED.get(name, name), list(METHODS)) or f"; choose from {', '.join(METHODS)}"
         raise OptionError(f"there is no benchmark method {name!r}{hint}")
     for library in entry.needs:
         if importlib.util.find_spec(library) is None:

@@ -3,8 +3,9 @@
     runs = run_protocol(pair_folders(data), ["mtpcr-geo", "kiss-matcher:voxel=1"], Path("out"), starts=10)
 
 Results are one JSON line a run in ``runs.jsonl``; what is there is not run again. ``protocol.json``
-beside it says how the starts are drawn: results of two protocols never mix. What libraries print goes to
-``methods.log``.
+beside it says how the starts are drawn: results of two protocols never mix. What a run printed stands in
+``printed/``, a file each, which the row names (``printed``); what libraries print between runs goes to
+``methods.log``. A run without an answer has no time, and its reason says what happened.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from mtpcr_geo.benchmark.baselines.process import ending, kept_of, with_telling
 from mtpcr_geo.benchmark.methods import make_method
-from mtpcr_geo.benchmark.worker import StartRange, Task, work
+from mtpcr_geo.benchmark.worker import PRINTED, StartRange, Task, work
 from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError, OutputError
 from mtpcr_geo.core.progress import NoProgress
 
@@ -35,6 +37,9 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 RUNS, PROTOCOL, LOG = "runs.jsonl", "protocol.json", "methods.log"
 LOADING_LIMIT_S = 600.0
+# an external command is stopped by its own process, which then still reads and reports; only if it does not
+# is that process stopped
+_GRACE_S = 20.0
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 FRAME = "metres; origin at the middle of the target's bounds; z up"
 
@@ -97,11 +102,15 @@ def run_protocol(
         for method in methods:
             left = [k for k in range(starts) if (folder.name, method, k) not in there]
             if left:
-                waiting.append(Task(Path(folder), method, tuple(left), ranges, threads, out / LOG))
+                waiting.append(
+                    Task(Path(folder), method, tuple(left), ranges, threads, out / LOG, time_limit_s)
+                )
     count = sum(len(task.starts) for task in waiting)
     bars = progress or NoProgress()
     with _results(path) as file, bars.task("benchmark runs", count) as advance:
         _drive(waiting, jobs, time_limit_s, file, advance)
+    if (out / PRINTED).exists() and not any((out / PRINTED).iterdir()):
+        (out / PRINTED).rmdir()
     wanted = {(folder.name, method) for folder in folders for method in methods}
     return [row for row in read_rows(path) if (row["pair"], row["method"]) in wanted]
 
@@ -177,13 +186,14 @@ def _drive(waiting: deque[Task], jobs: int, limit: float, file: TextIO, advance:
         file.flush()
         advance(1)
 
-    def give_up(one: _Running, reason: str, seconds: float) -> None:
+    def give_up(one: _Running, reason: str) -> None:
         # the start under way has no answer; those behind it get a process of their own
         assert one.begun is not None
-        one.left.popleft()
+        name, printed = _printed(one.task, one.left.popleft())
         write(
             one.begun
-            | {"verdict": "unjudged", "reason": reason, "time_s": seconds, "memory_mib": None, "details": {}}
+            | {"verdict": "unjudged", "reason": with_telling(reason, printed), "time_s": None}
+            | {"memory_mib": None, "details": {}, "printed": name}
         )
         if one.left:
             waiting.appendleft(replace(one.task, starts=tuple(one.left)))
@@ -221,14 +231,35 @@ def _drive(waiting: deque[Task], jobs: int, limit: float, file: TextIO, advance:
                 seconds = time.monotonic() - one.last_message
                 if seconds > _patience(one, limit):
                     del running[pipe]
-                    one.process.kill()
-                    one.process.join()
+                    _stop(one.process)
                     if one.begun is None:
                         raise InputError(f"{one.task.folder} was not read within {LOADING_LIMIT_S:g} s")
-                    give_up(one, f"stopped at the time limit of {limit:g} s", seconds)
+                    give_up(one, f"stopped at the time limit of {limit:g} s")
     finally:
         for one in running.values():
-            one.process.terminate()
+            _stop(one.process)
+
+
+def _stop(process: SpawnProcess) -> None:
+    """End a process: asked first, so that it takes along an external command, then not asked."""
+    process.terminate()
+    process.join(5.0)
+    if process.exitcode is None:
+        process.kill()
+        process.join()
+
+
+def _printed(task: Task, start: int) -> tuple[str, str]:
+    """Return the name and the content of what a run printed, empty where it printed nothing."""
+    assert task.log is not None
+    name = task.printed(start)
+    path = task.log.parent / name
+    if not path.exists():
+        return "", ""
+    if path.stat().st_size == 0:
+        path.unlink()
+        return "", ""
+    return name, kept_of(path)
 
 
 @contextmanager
@@ -247,7 +278,9 @@ def threads_of_children(count: int) -> Iterator[None]:
 
 
 def _patience(one: _Running, limit: float) -> float:
-    return limit if one.begun is not None else LOADING_LIMIT_S
+    if one.begun is None:
+        return LOADING_LIMIT_S
+    return limit + (_GRACE_S if one.task.method.startswith("external:") else 0.0)
 
 
 def _received(pipe: Connection) -> tuple[str, Any]:
@@ -260,11 +293,11 @@ def _received(pipe: Connection) -> tuple[str, Any]:
 
 def _ended(one: _Running, give_up: Any) -> None:
     """Deal with a process that ended in the middle: killed for memory, or crashed."""
-    code = one.process.exitcode
+    how = ending(one.process.exitcode)
     if one.begun is None:
         raise MtpcrError(
             f"the process for {one.task.folder.name} with {one.task.method} ended before its first run "
-            f"(exit code {code}); see {one.task.log}"
+            f"({how}); see {one.task.log}"
         )
     if one.left:
-        give_up(one, f"the process ended with exit code {code}", time.monotonic() - one.last_message)
+        give_up(one, f"the process was lost, {how}")

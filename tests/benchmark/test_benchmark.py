@@ -2,17 +2,15 @@ from __future__ import annotations
 
 import csv
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY
 from helpers_scene import houses
 from typer.testing import CliRunner
 
 from mtpcr_geo.benchmark import methods, pairs, published, standins, tables
-from mtpcr_geo.benchmark.baselines import external, fpfh
+from mtpcr_geo.benchmark.baselines import fpfh
 from mtpcr_geo.benchmark.baselines.open3d import import_open3d
 from mtpcr_geo.benchmark.pairs import write_laz
 from mtpcr_geo.benchmark.plots import binned, cumulative
@@ -141,6 +139,7 @@ def test_folder_without_pairs_or_with_a_bad_one_is_refused(data, tmp_path):
     ("spec", "message"),
     [
         ("icpp", "icp"),
+        ("fpfh-gnc", "did you mean 'fpfh-kiss-solver'"),
         ("icp:voxl=1", "voxel"),
         ("icp:voxel", "option=value"),
         ("fpfh-svd:voxel=0", "above 0"),
@@ -179,11 +178,16 @@ def test_ours_answers_with_a_verdict(clouds):
 
 @pytest.mark.parametrize(
     "spec",
-    ["fpfh-ransac:voxel=2,iterations=50000", "fpfh-fgr:voxel=2", "fpfh-svd:voxel=2", "fpfh-gnc:voxel=2"]
-    + ["kiss-matcher:voxel=1.5"],
+    [
+        "fpfh-ransac:voxel=2,iterations=50000",
+        "fpfh-fgr:voxel=2",
+        "fpfh-svd:voxel=2",
+        "fpfh-kiss-solver:voxel=2",
+    ]
+    + ["kiss-matcher:voxel=1.5", "kiss-matcher:voxel=2,quatro=yes"],
 )
 def test_baselines_register_an_easy_pair(spec, clouds, capfd):
-    if "gnc" in spec or "kiss" in spec:
+    if "kiss" in spec:
         pytest.importorskip("kiss_matcher", reason="kiss-matcher is not installed (extra benchmark)")
     source, target, T_true = clouds
     answer = methods.make_method(spec).estimate(source, target, seed=1)
@@ -202,100 +206,6 @@ def test_least_squares_fit_is_exact():
     )
     xyz = rng.normal(size=(10, 3))
     assert np.allclose(fpfh.best_rigid(xyz, transforms.apply(T, xyz)), T)
-
-
-SCRIPT = """
-import sys, threading
-import numpy as np
-what, source, target, result = sys.argv[1:]
-if what == "fail":
-    sys.exit("not today")
-if what == "hang":
-    threading.Event().wait()
-if what == "eat":
-    held = [bytearray(2**26) for _ in range(64)]
-read = np.load if source.endswith("npy") else np.loadtxt
-T = np.eye(4)
-T[:3, 3] = read(target).mean(axis=0) - read(source).mean(axis=0)
-with open(result, "w") as file:
-    if what == "short":
-        T = T[:2]
-    file.write(f"target: cloud_1.ply 2\\n{T}\\n")
-"""
-
-
-def external_method(folder: Path, what: str, **more) -> external.External:
-    (folder / "method.py").write_text(SCRIPT)
-    command = [sys.executable, "{here}/method.py", what, "{source}", "{target}", "{result}"]
-    (folder / "method.json").write_text(json.dumps({"command": command, "format": "npy"} | more))
-    made = methods.make_method(f"external:file={folder / 'method.json'}")
-    assert isinstance(made, external.External)
-    return made
-
-
-@pytest.mark.parametrize("form", ["npy", "xyz"])
-def test_external_command_gives_its_transform(tmp_path, form):
-    xyz = np.random.default_rng(0).normal(size=(50, 3)).round(6)
-    answer = external_method(tmp_path, "work", format=form).estimate(xyz, xyz + [1.0, 2.0, 3.0], seed=0)
-    assert answer.reason == ""
-    assert answer.T_target_source is not None
-    assert np.allclose(answer.T_target_source, transforms.translation((1.0, 2.0, 3.0)), atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("what", "more", "reason"),
-    [
-        ("fail", {}, "exit code 1: not today"),
-        ("hang", {"time_limit_s": 0.5}, "time limit of 0.5 s"),
-        ("eat", {"memory_limit_mib": 2000, "environment": {"OPENBLAS_NUM_THREADS": "1"}}, "MemoryError"),
-        ("short", {}, "8 numbers"),
-    ],
-)
-def test_external_command_that_fails_is_a_run_without_answer(tmp_path, what, more, reason):
-    if what == "eat" and sys.platform != "linux":
-        pytest.skip("address space cannot be limited here")
-    xyz = np.zeros((5, 3))
-    answer = external_method(tmp_path, what, **more).estimate(xyz, xyz, seed=0)
-    assert answer.T_target_source is None
-    assert reason in answer.reason
-
-
-def test_scale_in_an_external_answer_is_taken_out():
-    rigid = transforms.compose(transforms.yaw_matrix(0.3), np.array([1.0, 2.0, 3.0]))
-    centroid = np.array([50.0, 20.0, 5.0])
-    scaled = rigid @ transforms.translation(centroid) @ np.diag([1.02, 1.02, 1.02, 1.0])
-    T, scale = external.rigid_part(scaled @ transforms.translation(-centroid), centroid)
-    assert scale == pytest.approx(1.02)
-    assert np.allclose(T, rigid)
-
-
-def test_external_point_files_hold_the_points(tmp_path):
-    xyz = np.random.default_rng(1).uniform(-50, 50, (200, 3))
-    described = external.Description(command=["x"])
-    external.write_points(tmp_path / "a.ply", xyz, described)
-    head, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
-    assert b"element vertex 200" in head
-    assert np.array_equal(np.frombuffer(body).reshape(-1, 3), xyz)
-    import laspy
-
-    described = external.Description(command=["x"], format="laz", crs=25832)
-    external.write_points(tmp_path / "a.laz", xyz, described)
-    las = laspy.read(tmp_path / "a.laz")
-    assert np.abs(las.xyz - xyz).max() < 0.0006
-    assert las.header.parse_crs().to_epsg() == 25832
-
-
-def test_described_commands_of_other_projects_are_valid():
-    folder = REPOSITORY / "examples" / "external"
-    names = {path.stem for path in folder.glob("*.json")}
-    assert {"codem", "plade", "predator", "geotransformer"} <= names
-    for path in folder.glob("*.json"):
-        described = external.External(str(path)).description
-        words = " ".join(described.command)
-        assert all(word in words for word in ("{source}", "{target}", "{result}"))
-        for word in described.command:
-            if word.startswith("{here}/"):
-                assert (folder / word.removeprefix("{here}/")).is_file()
 
 
 def row(method="a", pair="p", group="A-G", verdict="unjudged", errors=None, **more):
