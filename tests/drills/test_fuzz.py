@@ -36,6 +36,7 @@ FOUND = {
     "bounds whose difference overflows": ("files", 184),
     "layers larger than their chunk": ("files", 21442),
     "bounds whose norm overflows": ("files", 30040),
+    "points of which the check leaves out all": ("files", 40204),
     "points that a transform moves to infinity": ("files", 459),
 }
 
