@@ -206,7 +206,7 @@ def _guess(bounds: Floats, points: int) -> str:
             return "; its x and y look like degrees"
         return "; its x and y look local"
     # origins of grids lie far outside of what they map
-    if np.abs(plan).max() < NEAR_ORIGIN_M or (plan[0] * plan[1] <= 0).all():
+    if np.abs(plan).max() < NEAR_ORIGIN_M or (np.sign(plan[0]) * np.sign(plan[1]) <= 0).all():
         return "; its x and y look local"
     with np.errstate(over="ignore"):
         # the header may state bounds of any size
