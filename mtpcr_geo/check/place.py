@@ -208,9 +208,12 @@ def _guess(bounds: Floats, points: int) -> str:
             return "; its x and y look like degrees"
         return "; its x and y look local"
     # origins of grids lie far outside of what they map
-    if np.abs(plan).max() < NEAR_ORIGIN_M or (plan[0] * plan[1] <= 0).all():
+    if np.abs(plan).max() < NEAR_ORIGIN_M or (np.sign(plan[0]) * np.sign(plan[1]) <= 0).all():
         return "; its x and y look local"
-    if np.linalg.norm(low) > 6.2e6 and np.ptp([low, high], axis=0).max() < 1e5 and np.abs(low[2]) > 1e5:
+    with np.errstate(over="ignore"):
+        # the header may state bounds of any size
+        geocentric = np.linalg.norm(low) > 6.2e6 and np.ptp([low, high], axis=0).max() < 1e5
+    if geocentric and np.abs(low[2]) > 1e5:
         return "; its coordinates look geocentric"
     return "; its x and y look like a national grid or UTM"
 

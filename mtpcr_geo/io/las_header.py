@@ -22,6 +22,8 @@ _RECORD_HEAD = 54
 _VERSIONS = [(1, minor) for minor in range(5)]
 _LEGACY_COUNT, _EXTENDED = 107, 235
 _CHUNK_MOST = 10_000_000  # points that a chunk may promise beyond those of the file
+# of the point, and of colours, infrared and wave packets where the format has them
+_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}
 
 
 class Head:
@@ -213,3 +215,27 @@ def _check_chunk_table(stream: BinaryIO, header: laspy.LasHeader, count: int, re
     promised = [points for points, _ in entries]
     if not fits or sum(promised) < count or max(promised) > max(count, _CHUNK_MOST):
         raise ValueError("the table of its compressed chunks does not fit its header")
+    _check_layers(stream, header, [length for _, length in entries])
+
+
+def _check_layers(stream: BinaryIO, header: laspy.LasHeader, lengths: list[int]) -> None:
+    """Check the sizes that each chunk of point formats 6 to 10 begins with: lazrs takes memory by them.
+
+    Behind a chunk's first point, as it is, and its count stand the sizes of its layers, 32 bits each.
+
+    Raises:
+        ValueError: if they are larger than the chunk.
+
+    """
+    kind = header.point_format
+    layers = _LAYERS.get(kind.id)
+    if layers is None:
+        return
+    layers += kind.num_extra_bytes
+    place = header.offset_to_point_data + 8
+    for length in lengths:
+        stream.seek(place + kind.size + 4)
+        sizes = stream.read(4 * layers)
+        if length and sum(struct.unpack(f"<{len(sizes) // 4}I", sizes[: len(sizes) // 4 * 4])) > length:
+            raise ValueError("a compressed chunk is smaller than its layers")
+        place += length

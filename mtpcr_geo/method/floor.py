@@ -112,7 +112,8 @@ def _lowest(xyz: Floats, cell: float) -> Floats:
     column, row = np.floor((xyz[:, :2] - low) / cell).astype(np.int64).T
     key = column * (int(row.max(initial=0)) + 1) + row
     order = np.lexsort((xyz[:, 2], key))
-    first = np.concatenate([[True], np.diff(key[order]) > 0])
+    # hardly any points may all be left out
+    first = np.concatenate([[True], np.diff(key[order]) > 0])[: len(order)]
     return np.asarray(xyz[order[first]])
 
 

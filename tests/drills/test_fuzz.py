@@ -34,6 +34,9 @@ FOUND = {
     "a PTX scan of endless numbers": ("files", 2717),
     "a file name of 400 letters": ("models", 1479),
     "bounds whose difference overflows": ("files", 184),
+    "layers larger than their chunk": ("files", 21442),
+    "bounds whose norm overflows": ("files", 30040),
+    "points of which the check leaves out all": ("files", 40204),
     "points that a transform moves to infinity": ("files", 459),
 }
 

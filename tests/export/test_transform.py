@@ -16,7 +16,7 @@ from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import CrsError, InputError, OutputError
 from mtpcr_geo.core.types import Pair, Side
 from mtpcr_geo.crs import TransformChain, resolve_frames
-from mtpcr_geo.export.apply import apply_transform, moved_by
+from mtpcr_geo.export.apply import apply_transform, far_text, moved_by
 from mtpcr_geo.export.descriptions import shift_text, transform_rows
 from mtpcr_geo.export.pdal_file import write_pdal_pipeline
 from mtpcr_geo.export.prior_file import read_pose
@@ -352,6 +352,10 @@ def test_apply_refuses_a_cloud_without_crs_that_lies_far_away(tmp_path, inverse)
                 moved_by(chain, cloud, inverse=inverse)
         else:
             assert moved_by(chain, cloud, inverse=inverse).count == 2
+        # one in the same CRS is moved, and that it lies far away is said
+        start = (chain.target if inverse else chain.source).file_crs
+        same = ArrayCloud(near + [away * diagonal, 0, 0], start)
+        assert (far_text(chain, same, inverse=inverse) is not None) == (away > 1.5)
 
 
 @pytest.mark.parametrize(

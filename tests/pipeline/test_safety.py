@@ -118,6 +118,13 @@ def test_a_local_vrt_is_no_matter_nor_one_that_names_itself(tmp_path, monkeypatc
     refuse({"type": "filters.dem", "raster": "a.vrt"})
 
 
+@pytest.mark.parametrize("name", ["scan_1:a.laz", "<b>.laz", "PG:x.laz"])
+def test_a_colon_in_the_name_of_a_cloud_is_no_connection(name):
+    check(link(parse(json.dumps([{"type": "readers.las", "filename": name}, "o.laz"]))), CLOSED)
+    with pytest.raises(OptionError, match="remote or virtual"):
+        check(link(parse(json.dumps([{"type": "readers.gdal", "filename": name}, "o.laz"]))), CLOSED)
+
+
 def test_writers_of_several_files_are_refused():
     for stage, words in (
         ({"type": "writers.ogr", "filename": "a.shp"}, "shapefile"),
