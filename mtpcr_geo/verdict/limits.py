@@ -122,4 +122,4 @@ class Limits:
     refined_away: float = 2.0
     ground_agreeing: float = 0.7
     ground_shape: float = 0.35
-    objects_missing: float = 0.12
+    objects_missing: float = 0.10
