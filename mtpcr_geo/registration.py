@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from html import escape
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
@@ -249,7 +250,10 @@ class Registration:
     def __repr__(self) -> str:
         rows = self._rows()
         width = max((len(name) for name, _ in rows), default=0)
-        lines = [f"Registration: {self.verdict.name}", f"  {self.verdict.headline}"]
+        lines = [
+            f"Registration: {self.verdict.name}",
+            *(f"  {line}" for line in wrap(self.verdict.headline, 108)),
+        ]
         return visible("\n".join(lines + [f"  {name:<{width}}  {text}" for name, text in rows]))
 
     def _repr_html_(self) -> str:

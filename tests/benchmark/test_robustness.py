@@ -16,7 +16,15 @@ from typer.testing import CliRunner
 from mtpcr_geo.benchmark.metrics import overlap_ratios
 from mtpcr_geo.benchmark.pairs import write_laz
 from mtpcr_geo.benchmark.robustness import drive
-from mtpcr_geo.benchmark.robustness.cases import Case, CommonFrame, middle_of_overlap, target_crs_of
+from mtpcr_geo.benchmark.robustness.cases import (
+    Case,
+    CommonFrame,
+    DiscClouds,
+    ElsewhereClouds,
+    MirroredClouds,
+    middle_of_overlap,
+    target_crs_of,
+)
 from mtpcr_geo.benchmark.robustness.places import dense_places, shared_places
 from mtpcr_geo.benchmark.robustness.results import (
     RowFile,
@@ -164,17 +172,32 @@ def test_suites_list_the_runs_that_are_asked_for(data):
     counts = {name: len(runs) for name, runs in chosen.items()}
     assert counts == {
         "pairs": 4, "tilts": 4, "discs": 36, "plots": 100, "swap": 2, "repeating": 60,
-        "repeating-apart": 60, "unrelated": 4, "standins": 28, "overlap": 49,
+        "repeating-apart": 60, "symmetric": 40, "unrelated": 4, "mirrored": 14, "elsewhere": 12,
+        "standins": 28, "overlap": 49,
     }  # fmt: skip
     everything = [case for runs in chosen.values() for case in runs]
     assert len({case.name for case in everything}) == len(everything)
     assert pickle.loads(pickle.dumps(everything)) == everything
     assert {case.has_truth for case in chosen["unrelated"] + chosen["repeating-apart"]} == {False}
+    assert {case.has_truth for case in chosen["mirrored"] + chosen["elsewhere"]} == {False}
     assert all(case.level == "auto" and case.ranges.tilt_deg == 10.0 for case in chosen["tilts"])
     assert len({case.batch for case in chosen["discs"]}) == 2
     assert len(list(cases(["discs", "pairs"], replace(options, only=("town1",))))) == 20
     other = list(cases(["plots"], replace(options, seed=6)))
     assert not {case.seed for case in other} & {case.seed for case in chosen["plots"]}
+
+
+def test_discs_elsewhere_share_nothing_and_mirrored_ones_are_reflected(data):
+    folder = data / "town1"
+    disc = DiscClouds(folder, 20.0, 0).make()
+    elsewhere = ElsewhereClouds(folder, 20.0, 0).make()
+    assert np.array_equal(elsewhere.source, disc.source)
+    away = np.hypot(*(elsewhere.target[:, :2] - disc.source[:, :2].mean(axis=0)).T)
+    assert away.min() > 30.0
+    mirrored = MirroredClouds(folder, 20.0, 0).make()
+    assert np.array_equal(mirrored.target, disc.target)
+    assert np.allclose(mirrored.source[:, 1:], disc.source[:, 1:])
+    assert np.allclose(mirrored.source[:, 0] + disc.source[:, 0], 2 * np.median(disc.source[:, 0]))
 
 
 def test_suite_that_is_not_there_is_named():
