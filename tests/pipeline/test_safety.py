@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from helpers_security import VRT, WMS
+from pyproj import CRS
 from typer.testing import CliRunner
 
 import mtpcr_geo
@@ -113,6 +114,15 @@ def test_a_colon_in_the_name_of_a_cloud_is_no_connection(name):
     check(link(parse(json.dumps([{"type": "readers.las", "filename": name}, "o.laz"]))), CLOSED)
     with pytest.raises(OptionError, match="remote or virtual"):
         check(link(parse(json.dumps([{"type": "readers.gdal", "filename": name}, "o.laz"]))), CLOSED)
+
+
+@pytest.mark.parametrize("as_text", [True, False])
+def test_a_crs_as_json_names_a_schema_that_nobody_fetches(as_text):
+    srs = CRS.from_epsg(25833).to_json_dict()
+    assert srs["$schema"].startswith("https://")
+    refuse({"type": "filters.reprojection", "out_srs": json.dumps(srs) if as_text else srs})
+    with pytest.raises(OptionError, match="remote or virtual"):
+        refuse({"type": "filters.reprojection", "out_srs": srs | {"$schema": "https://x/proj.org/schemas/"}})
 
 
 def test_writers_of_several_files_are_refused():
