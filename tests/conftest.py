@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,6 +59,15 @@ def shared_models() -> Path:
 def pdal():
     """The pdal package; tests that need it skip where it is not installed."""
     return pytest.importorskip("pdal", reason="PDAL is not installed")
+
+
+@pytest.fixture
+def hears() -> Iterator[tuple[str, list[Any]]]:
+    """The address of a server on this machine, and the list of those who have come."""
+    from helpers_security import listening
+
+    with listening() as server:
+        yield server
 
 
 @pytest.fixture(scope="session")

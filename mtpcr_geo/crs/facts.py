@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mtpcr_geo.core.errors import CrsError
 from mtpcr_geo.core.scanner import PLAIN, Scanner
+from mtpcr_geo.crs.faults import crs_errors
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 # what stands for a vertical datum where none is known, in letters alone
 _NO_NAMES = {"", "unknown", "unnamed", "undefined", "notspecified", "notspecifiedbasedonunspecifiedellipsoid"}
 _NOT_SPECIFIED = "notspecified"
+# metres or radians a unit: from micrometres to light years, or to a tenth of a microsecond of arc
+_SMALLEST_UNIT, _LARGEST_UNIT = 1e-13, 1e17
 
 Kind = Literal["projected", "geographic", "geocentric", "local"]
 Height = Literal["datum", "ellipsoidal", "unsaid"]
@@ -72,6 +75,7 @@ class CrsFacts:
         return "heights of no stated datum"
 
 
+@crs_errors()
 def facts_of(crs: CRS | None, scanner: Scanner = PLAIN) -> CrsFacts:
     """Take a CRS apart; None means local coordinates.
 
@@ -155,6 +159,7 @@ def unbound(crs: CRS) -> CRS:
     return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
 
 
+@crs_errors()
 def metric(crs: CRS) -> CRS:
     """Return the same projected or vertical CRS in metres; itself if it is. A bound one stays bound."""
     from pyproj import CRS
@@ -268,7 +273,10 @@ def _parts(crs: CRS) -> tuple[CRS, CRS | None]:
 
 
 def _factor(axis: Any) -> float:
-    return float(axis.unit_conversion_factor)
+    factor = float(axis.unit_conversion_factor)
+    if not _SMALLEST_UNIT <= factor <= _LARGEST_UNIT:
+        raise CrsError(f"a unit of {factor:g} metres or radians, as a CRS states it, is none; check its WKT")
+    return factor
 
 
 def _check_axes(name: str, axes: list[Any]) -> None:

@@ -11,6 +11,7 @@ from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError, OptionError
 from mtpcr_geo.core.frames import FrameLink
 from mtpcr_geo.crs.facts import facts_of, same_place
+from mtpcr_geo.crs.faults import crs_errors
 from mtpcr_geo.crs.operation import area_of
 from mtpcr_geo.crs.resolve import parse_crs
 
@@ -118,6 +119,7 @@ def _hits(near: Place, crs: str | None, link: FrameLink, bounds: Floats, reach: 
     return distance_to_box(place, bounds) <= reach
 
 
+@crs_errors()
 def _in_target_crs(near: Place, text: str, link: FrameLink) -> Place:
     named = parse_crs(text)
     target = facts_of(link.file_crs)

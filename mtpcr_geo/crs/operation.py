@@ -11,6 +11,7 @@ import numpy as np
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError
 from mtpcr_geo.core.frames import OperationReport
+from mtpcr_geo.crs.faults import crs_errors
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -42,6 +43,7 @@ class Operation:
         return OperationReport(self.name, self.accuracy, self.grids)
 
 
+@crs_errors()
 def best_operation(start: CRS, end: CRS, area: AreaOfInterest | None) -> Operation:
     """Return the most accurate operation for an area, and refuse to take a lesser one.
 
@@ -94,6 +96,7 @@ def best_operation(start: CRS, end: CRS, area: AreaOfInterest | None) -> Operati
     )
 
 
+@crs_errors()
 def area_of(facts: CrsFacts, points: Floats) -> AreaOfInterest | None:
     """Return the area in degrees that (n, 3) coordinates of a CRS cover; None where they are beyond it."""
     from pyproj import Transformer
@@ -147,6 +150,7 @@ def geographic_of(crs: CRS) -> CRS:
     return base.to_2d()
 
 
+@crs_errors()
 def local_projection(facts: CrsFacts, area: AreaOfInterest) -> CRS:
     """Return a transverse Mercator of true scale in the middle of an area, on the same datum, in metres.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ from mtpcr_geo.core.errors import CrsError, InputError
 from mtpcr_geo.core.frames import FrameLink, OperationReport, Vertical, WorkFrame, box_points, run_pipeline
 from mtpcr_geo.core.scanner import PLAIN, Scanner
 from mtpcr_geo.crs.facts import CrsFacts, facts_of, metric, same_datum, same_heights, same_place, unbound
+from mtpcr_geo.crs.faults import crs_errors
 from mtpcr_geo.crs.operation import area_of, best_operation, grid_scale, local_projection
 
 if TYPE_CHECKING:
@@ -40,13 +42,23 @@ def parse_crs(text: str) -> CRS | None:
     if text.strip().lower() == LOCAL:
         return None
     try:
-        return CRS.from_user_input(text)
-    except CRSError as error:
+        with warnings.catch_warnings():
+            # pyproj would have "+init=epsg:25832" written in another way
+            warnings.simplefilter("ignore", FutureWarning)
+            return CRS.from_user_input(text)
+    except (CRSError, UnicodeError) as error:
         raise CrsError(
-            f"{text!r} is not a coordinate reference system; give for example EPSG:25832, EPSG:7415 or local"
+            f"{_short(text)} is not a coordinate reference system; give for example EPSG:25832, EPSG:7415 or "
+            "local"
         ) from error
 
 
+def _short(text: str) -> str:
+    quoted = repr(text)
+    return quoted if len(quoted) <= 100 else f"{quoted[:60]}...{quoted[-37:]}"
+
+
+@crs_errors()
 def resolve_frames(
     target: Cloud,
     source: Cloud,

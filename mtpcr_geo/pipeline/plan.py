@@ -105,6 +105,9 @@ def _needs_pdal(spec: StageSpec) -> bool:
 
 
 def _we_can(spec: StageSpec) -> bool:
+    if "://" in (file_of(spec.options) or ""):
+        # PDAL fetches what is elsewhere
+        return False
     options = {key: value for key, value in spec.options.items() if key != "user_data"}
     try:
         stage_types()[spec.type].Options.model_validate(options)
@@ -125,6 +128,7 @@ def _connect(specs: Sequence[StageSpec], stages: Mapping[str, Stage]) -> None:
     for spec in specs:
         stage = stages[spec.tag]
         name = file_of(spec.options) if spec.type in ("readers.las", "readers.copc") else None
+        name = None if name and "://" in name else name
         # the source comes last, and is what mtpcr.apply moves
         files[spec.tag] = Path(name) if name else next((files[t] for t in reversed(spec.inputs)), None)
         if not isinstance(stage, PdalStage):

@@ -32,6 +32,8 @@ _SERVICES = re.compile(
 _NAMED = re.compile(
     r"<(SourceFilename|SourceDataset|SrcDataSource|SourceDataSource|KernelFilename|DEMFilename)\b[^>]*>\s*([^<]+?)\s*<"
 )
+# a CRS as JSON names its schema, which PROJ does not fetch
+_SCHEMA, _SCHEMA_OF_CRS = "$schema", "https://proj.org/schemas/"
 _LOOK_BYTES = 4 * 2**20
 _DEEPEST = 8
 
@@ -84,6 +86,8 @@ def _texts_of(name: str, value: Any, depth: int) -> Iterator[tuple[str, str]]:
     elif isinstance(value, list):
         for one in value:
             yield from _texts_of(name, one, depth + 1)
+    elif name == _SCHEMA and str(value).startswith(_SCHEMA_OF_CRS):
+        return
     elif isinstance(value, str):
         inner = _json_in(value)
         if inner is None:

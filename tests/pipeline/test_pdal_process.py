@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers_security import write_ept
 from typer.testing import CliRunner
 
 import mtpcr_geo
@@ -27,24 +28,6 @@ FAUX = {"type": "readers.faux", "bounds": "([0, 9], [0, 9], [0, 9])", "mode": "c
 def features(geometry: Any) -> str:
     one = {"type": "Feature", "properties": {"c": 1}, "geometry": geometry}
     return json.dumps({"type": "FeatureCollection", "features": [one]})
-
-
-def write_ept(folder: Path) -> Path:
-    """Write an Entwine point tile of a hundred points."""
-    for name in ("ept-data", "ept-hierarchy"):
-        (folder / name).mkdir(parents=True)
-    xyz = np.random.default_rng(0).integers(0, 1000, (100, 3)).astype("<i4")
-    dimension = {"type": "signed", "size": 4, "scale": 0.01, "offset": 0, "minimum": 0, "maximum": 10}
-    bounds = [0, 0, 0, 10, 10, 10]
-    facts = {
-        "bounds": bounds, "boundsConforming": bounds, "dataType": "binary", "hierarchyType": "json",
-        "points": 100, "schema": [{"name": axis, **dimension} for axis in "XYZ"], "span": 128, "srs": {},
-        "version": "1.0.0",
-    }  # fmt: skip
-    (folder / "ept.json").write_text(json.dumps(facts))
-    (folder / "ept-hierarchy/0-0-0-0.json").write_text(json.dumps({"0-0-0-0": 100}))
-    (folder / "ept-data/0-0-0-0.bin").write_bytes(xyz.tobytes())
-    return folder / "ept.json"
 
 
 def newer(pdal: Any) -> bool:

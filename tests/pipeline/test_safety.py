@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import socketserver
-import subprocess
-import sys
-import threading
 from pathlib import Path
 
 import pytest
+from helpers_security import VRT, WMS
+from pyproj import CRS
 from typer.testing import CliRunner
 
 import mtpcr_geo
@@ -89,13 +87,6 @@ def test_remote_names_are_found_wherever_they_stand(name):
     refuse(REMOTE[name], access=Access(network=True))
 
 
-WMS = "<GDAL_WMS><Service name='TMS'><ServerUrl>{url}/x</ServerUrl></Service></GDAL_WMS>"
-VRT = (
-    "<VRTDataset rasterXSize='1' rasterYSize='1'><VRTRasterBand dataType='Byte' band='1'><SimpleSource>"
-    "<SourceFilename relativeToVRT='1'>{url}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
-)
-
-
 @pytest.mark.parametrize("kind", ["filters.colorization", "filters.dem", "filters.hag_dem", "readers.gdal"])
 @pytest.mark.parametrize("file", ["a.vrt", "b.vrt", "wms.xml", "dem.tif"])
 def test_files_that_name_remote_ones_are_looked_into(kind, file, tmp_path, monkeypatch):
@@ -125,6 +116,15 @@ def test_a_colon_in_the_name_of_a_cloud_is_no_connection(name):
         check(link(parse(json.dumps([{"type": "readers.gdal", "filename": name}, "o.laz"]))), CLOSED)
 
 
+@pytest.mark.parametrize("as_text", [True, False])
+def test_a_crs_as_json_names_a_schema_that_nobody_fetches(as_text):
+    srs = CRS.from_epsg(25833).to_json_dict()
+    assert srs["$schema"].startswith("https://")
+    refuse({"type": "filters.reprojection", "out_srs": json.dumps(srs) if as_text else srs})
+    with pytest.raises(OptionError, match="remote or virtual"):
+        refuse({"type": "filters.reprojection", "out_srs": srs | {"$schema": "https://x/proj.org/schemas/"}})
+
+
 def test_writers_of_several_files_are_refused():
     for stage, words in (
         ({"type": "writers.ogr", "filename": "a.shp"}, "shapefile"),
@@ -145,25 +145,6 @@ def test_the_switches_are_those_of_the_process_alone(monkeypatch):
     assert closed["GDAL_VRT_ENABLE_PYTHON"] == network["GDAL_VRT_ENABLE_PYTHON"] == "NO"
     assert os.environ["http_proxy"] == "http://mine"
     assert "GDAL_VRT_ENABLE_PYTHON" not in environment(Access(code=True, network=True))
-
-
-class Listening(socketserver.BaseRequestHandler):
-    """Note that somebody came, and hang up."""
-
-    def handle(self) -> None:
-        self.server.came.append(self.client_address)  # type: ignore[attr-defined]
-
-
-@pytest.fixture
-def hears():
-    """A server on this machine, and the list of those who have come."""
-    with socketserver.TCPServer(("127.0.0.1", 0), Listening) as server:
-        server.came = []  # type: ignore[attr-defined]
-        thread = threading.Thread(target=server.serve_forever, args=(0.05,))
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_address[1]}", server.came  # type: ignore[attr-defined]
-        server.shutdown()
-        thread.join()
 
 
 @pytest.mark.parametrize("arguments", [["--validate"], []])
@@ -199,29 +180,3 @@ def test_the_server_is_asked_only_where_the_network_is_allowed(
     with pytest.raises(MtpcrError, match="PDAL says"):
         pipeline.execute()
     assert bool(came) == network
-
-
-@pytest.mark.skipif(shutil.which("cc") is None or not sys.platform.startswith("linux"), reason="needs cc")
-@pytest.mark.parametrize("arguments", [["--validate"], []])
-def test_no_library_beside_a_pipeline_runs(arguments, pdal, town_files, tmp_path):
-    """Neither one that the pipeline names, nor one that lies in the current folder."""
-    (tmp_path / "evil.c").write_text(
-        "#include <stdio.h>\n__attribute__((constructor)) static void ran(void)"
-        '{ FILE *file = fopen("ran", "w"); if (file) fclose(file); }\n'
-    )
-    library = tmp_path / "libpdal_plugin_filter_evil.so"
-    subprocess.run(["cc", "-shared", "-fPIC", "-o", library, tmp_path / "evil.c"], check=True)
-    shutil.copy(town_files[1], tmp_path / "target.laz")
-    environment = {key: value for key, value in os.environ.items() if key != "PDAL_DRIVER_PATH"}
-    for stage in (
-        {"type": "filters.info", "plugin": str(library)},
-        {"type": "filters.evil"},
-        {"type": "filters.range", "limits": "Z[0:1000]"},
-    ):
-        (tmp_path / "p.json").write_text(json.dumps([READER, stage]))
-        command = [sys.executable, "-m", "mtpcr_geo", "pipeline", "p.json", *arguments]
-        done = subprocess.run(
-            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == (0 if stage["type"] == "filters.range" else 2), done.stderr
-        assert not (tmp_path / "ran").exists(), stage

@@ -65,7 +65,7 @@ def _stated_crs(file: Any) -> CRS | None:
         return None
     try:
         return CRS.from_user_input(root["coordinateMetadata"].value())
-    except CRSError:
+    except (CRSError, UnicodeError):
         return None
 
 

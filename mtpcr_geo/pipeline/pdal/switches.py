@@ -24,7 +24,14 @@ _NO_NETWORK = {
     "GML_DOWNLOAD_SCHEMA": "NO",
     "PROJ_NETWORK": "OFF",
 }
-_NO_CODE = {"GDAL_VRT_ENABLE_PYTHON": "NO", "OGR_SQLITE_LOAD_EXTENSIONS": ""}
+_NO_CODE = {"GDAL_VRT_ENABLE_PYTHON": "NO", "OGR_SQLITE_LOAD_EXTENSIONS": "", "PDAL_ALLOW_SHELL": "0"}
+# drivers that ask servers past curl, or that are for servers alone; GPSBabel starts a program. GDAL warns
+# of those that it lacks, so they are named only where PDAL's process keeps its standard error to itself
+_DRIVERS_OUT = (
+    "ADBC AmigoCloud Carto Cloudant CouchDB CSW DAAS DODS EEDA EEDAI Elasticsearch GEORASTER GPSBabel HANA "
+    "HTTP IDB INGRES JPIPKAK MongoDB MongoDBv3 MSSQLSpatial MySQL NGW OAPIF OCI ODBC OGDI OGR_DODS OGR_OGDI "
+    "PGeo PLMOSAIC PLSCENES PostGISRaster PostgreSQL RDA SDE STACIT STACTA WCS WFS WMS WMTS"
+)
 
 
 @dataclass(frozen=True)
@@ -42,7 +49,12 @@ class Access:
 
     @property
     def _closed(self) -> dict[str, str]:
-        return {**({} if self.code else _NO_CODE), **({} if self.network else _NO_NETWORK)}
+        closed = {**({} if self.code else _NO_CODE), **({} if self.network else _NO_NETWORK)}
+        if not (self.code or self.network):
+            mine = os.environ.get("GDAL_SKIP", "")
+            between = "," if "," in mine else " "
+            closed["GDAL_SKIP"] = between.join([*filter(None, [mine]), *_DRIVERS_OUT.split()])
+        return closed
 
 
 def environment(access: Access) -> dict[str, str]:
@@ -52,7 +64,8 @@ def environment(access: Access) -> dict[str, str]:
     it has: a library that lies beside a pipeline would run. It is let look where it is installed only, unless
     PDAL_DRIVER_PATH says where.
     """
-    variables = {**os.environ, **access._closed}
+    # where code is allowed, filters.shell needs no second leave
+    variables = {"PDAL_ALLOW_SHELL": "1", **os.environ, **access._closed}
     if not variables.get("PDAL_DRIVER_PATH"):
         variables["PDAL_DRIVER_PATH"] = _plugins_home()
     return variables
