@@ -81,7 +81,8 @@ PLADE = """
         assert np.allclose(np.linalg.norm(table[:, 3:], axis=1), 1, atol=1e-5)
         return table[:, :3]
 
-    T = solved(read(source, "source"), read(target, "target"))
+    fixed = read(target, "target")
+    T = solved(read(source, "source"), fixed)
     output.write(f"target: {{target}}\\nsource: {{source}}\\ntransformation:\\n")
     np.savetxt(output, T, "%.6g")
 """

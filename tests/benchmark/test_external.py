@@ -334,7 +334,8 @@ def test_every_end_is_told_in_the_runs(pair, tmp_path):
     # that of the benchmark counts where it is the lower time limit
     late, seed = tmp_path / "late", StartRange(seed=starts)
     write_results(run_protocol([pair], [method], late, starts=1, ranges=seed, time_limit_s=2.0), late, {})
-    lines = [line for folder in (out, late) for line in csv.DictReader((folder / "runs.csv").open())]
+    texts = [(folder / "runs.csv").read_text().splitlines() for folder in (out, late)]
+    lines = [line for text in texts for line in csv.DictReader(text)]
     assert len(lines) == len(TOLD)
     for what, line in enumerate(lines):
         assert line["reason"].startswith(TOLD[what])
