@@ -262,7 +262,7 @@ SYLVA = {
                 self.xyz, self.classified = xyz, False
     """,
     "sylva/ground.py": """
-        def classify_ground_csf(cloud):
+        def classify_ground_pmf(cloud):
             cloud.classified = True
             return cloud
     """,

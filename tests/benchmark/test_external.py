@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import json
 import sys
 import textwrap
@@ -15,6 +16,8 @@ from conftest import REPOSITORY
 
 from mtpcr_geo.benchmark import methods
 from mtpcr_geo.benchmark.baselines import external, normals, process
+from mtpcr_geo.benchmark.baselines.fpfh import Features
+from mtpcr_geo.benchmark.baselines.teaser import FpfhTeaser
 from mtpcr_geo.benchmark.pairs import write_laz
 from mtpcr_geo.benchmark.protocol import run_protocol
 from mtpcr_geo.benchmark.runs import write_results
@@ -223,8 +226,7 @@ def test_learned_method_in_training_would_give_the_truth_it_is_given(tmp_path, m
 
 def test_scale_is_raised_until_the_coarsest_points_are_few_enough(monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
-    import scaling
-
+    scaling = importlib.import_module("scaling")
     rng = np.random.default_rng(2)
     flat = rng.uniform((0.0, 0.0, 0.0), (200.0, 200.0, 0.5), (40_000, 3))
     assert scaling.fitted_scale([flat], 12.0, 0.2, 100_000) == 12.0
@@ -415,8 +417,6 @@ def teaser(tmp_path, monkeypatch):
 
 
 def test_teaser_is_right_and_refuses_where_nothing_agrees(teaser):
-    from mtpcr_geo.benchmark.baselines.fpfh import Features
-
     rng = np.random.default_rng(5)
     xyz = programs.scattered(rng)
 
@@ -430,12 +430,11 @@ def test_teaser_is_right_and_refuses_where_nothing_agrees(teaser):
 
     matches = np.stack([np.arange(len(xyz))] * 2, axis=1)
     moved = transforms.apply(T_TRUE, xyz)
-    answer = methods.make_method("fpfh-teaser:voxel=2").solve(Kept(xyz), Kept(moved), matches, 0)
+    answer = FpfhTeaser(voxel=2).solve(Kept(xyz), Kept(moved), matches, 0)
+    assert answer.T_target_source is not None
     assert np.allclose(answer.T_target_source, T_TRUE)
     assert answer.details["clique"] == 50
-    none = methods.make_method("fpfh-teaser:voxel=2,clique_limit_s=3").solve(
-        Kept(xyz), Kept(moved), matches, 0
-    )
+    none = FpfhTeaser(voxel=2, clique_limit_s=3).solve(Kept(xyz), Kept(moved), matches, 0)
     assert (none.T_target_source, none.verdict) == (None, "refused")
     assert "no two" in none.reason
 
