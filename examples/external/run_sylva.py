@@ -4,10 +4,10 @@
 
 SOURCE and TARGET are NPY. What the command ``sylva fusion-register`` does, by the function that it calls.
 Sylva wants classified ground in both clouds, which one of its own filters finds here: the morphological one
-(``classify_ground_pmf``), since its cloth (``--ground csf``, its default for dense plots) hangs in the crowns of
-clouds that show little ground. It also wants a rough place to search around: the middle of the source on that
-of the target, with a radius that reaches the whole target, and all headings. It gives no verdict; its report is
-printed, and kept with the run.
+(``classify_ground_pmf``), since its cloth (``--ground csf``, its default for dense plots) hangs in the crowns
+of clouds that show little ground. It also wants a rough place to search around: the middle of the source on
+that of the target, with a radius that reaches the whole target, and all headings. It gives no verdict; its
+report is printed, and kept with the run.
 """
 
 from __future__ import annotations
