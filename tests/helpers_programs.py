@@ -285,7 +285,7 @@ MAP_CLOSURES = {
         class MapClosuresConfig:
             inliers_threshold = 5
             def __init__(self, density_map_resolution):
-                assert density_map_resolution == 0.5
+                assert density_map_resolution == 1.0
     """,
     "map_closures/map_closures.py": """
         import numpy as np
