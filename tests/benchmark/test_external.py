@@ -465,13 +465,14 @@ def test_telling_lines():
     assert told("step 1\r\nerror: too few planes\nregistration failed\nlast") == (
         "error: too few planes; registration failed"
     )
+    assert told("reading\ntwo few planes\nregistration failed\n") == "two few planes; registration failed"
     many = "\n".join(f"cannot do {k}" for k in range(9))
     assert told(many) == "cannot do 0; cannot do 1; cannot do 8"
     trace = (
         "Traceback (most recent call last):\n  File 'x'\nlib.CustomError: it broke\nException ignored in x"
     )
     assert told(trace) == "lib.CustomError: it broke"
-    assert told("no errors reported here") == "no errors reported here"
+    assert told("working\nno errors reported here") == "no errors reported here"
 
 
 def test_much_that_is_printed_loses_its_middle(tmp_path):
