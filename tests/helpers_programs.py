@@ -81,7 +81,8 @@ PLADE = """
         assert np.allclose(np.linalg.norm(table[:, 3:], axis=1), 1, atol=1e-5)
         return table[:, :3]
 
-    T = solved(read(source, "source"), read(target, "target"))
+    fixed = read(target, "target")
+    T = solved(read(source, "source"), fixed)
     output.write(f"target: {{target}}\\nsource: {{source}}\\ntransformation:\\n")
     np.savetxt(output, T, "%.6g")
 """
@@ -261,7 +262,7 @@ SYLVA = {
                 self.xyz, self.classified = xyz, False
     """,
     "sylva/ground.py": """
-        def classify_ground_csf(cloud):
+        def classify_ground_pmf(cloud):
             cloud.classified = True
             return cloud
     """,
@@ -284,7 +285,7 @@ MAP_CLOSURES = {
         class MapClosuresConfig:
             inliers_threshold = 5
             def __init__(self, density_map_resolution):
-                assert density_map_resolution == 0.5
+                assert density_map_resolution == 1.0
     """,
     "map_closures/map_closures.py": """
         import numpy as np

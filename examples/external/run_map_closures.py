@@ -1,6 +1,6 @@
 """Match two maps with MapClosures 2.2 and write its transform; to be run in MapClosures' environment.
 
-    python run_map_closures.py SOURCE TARGET RESULT [--resolution 0.5]
+    python run_map_closures.py SOURCE TARGET RESULT [--resolution 1.0]
 
 SOURCE and TARGET are NPY. MapClosures looks for places seen before in a sequence of local maps: ORB features
 of bird's-eye-view point densities, aligned in two dimensions, with a plane of ground for the rest. The source
@@ -27,7 +27,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     for name in ("source", "target", "result"):
         parser.add_argument(name, type=Path)
-    parser.add_argument("--resolution", type=float, default=0.5, help="cell of the density map, metres")
+    # its own default of 0.5 m is for maps of whole scans: of thinned clouds it fills hardly a cell
+    parser.add_argument("--resolution", type=float, default=1.0, help="cell of the density map, metres")
     options = parser.parse_args()
     config = MapClosuresConfig(density_map_resolution=options.resolution)
     closures = MapClosures(config)

@@ -19,8 +19,10 @@ with ``configs/test/kitti.yaml`` the scale is 1. ``--weights random`` takes none
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import os
 import sys
+import types
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +53,10 @@ def main() -> None:
     # its modules, and the files that its configuration names, are found from its checkout
     os.chdir(options.checkout)
     sys.path.insert(0, os.getcwd())
+    for name in ("torchvision", "h5py"):
+        # imported for the data of ModelNet alone
+        if importlib.util.find_spec(name) is None:
+            sys.modules[name] = types.ModuleType(name)
     import torch
     from configs.models import architectures
     from datasets.dataloader import calibrate_neighbors, collate_fn_descriptor

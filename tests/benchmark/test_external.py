@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import json
 import sys
 import textwrap
@@ -15,6 +16,8 @@ from conftest import REPOSITORY
 
 from mtpcr_geo.benchmark import methods
 from mtpcr_geo.benchmark.baselines import external, normals, process
+from mtpcr_geo.benchmark.baselines.fpfh import Features
+from mtpcr_geo.benchmark.baselines.teaser import FpfhTeaser
 from mtpcr_geo.benchmark.pairs import write_laz
 from mtpcr_geo.benchmark.protocol import run_protocol
 from mtpcr_geo.benchmark.runs import write_results
@@ -223,8 +226,7 @@ def test_learned_method_in_training_would_give_the_truth_it_is_given(tmp_path, m
 
 def test_scale_is_raised_until_the_coarsest_points_are_few_enough(monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
-    import scaling
-
+    scaling = importlib.import_module("scaling")
     rng = np.random.default_rng(2)
     flat = rng.uniform((0.0, 0.0, 0.0), (200.0, 200.0, 0.5), (40_000, 3))
     assert scaling.fitted_scale([flat], 12.0, 0.2, 100_000) == 12.0
@@ -334,7 +336,8 @@ def test_every_end_is_told_in_the_runs(pair, tmp_path):
     # that of the benchmark counts where it is the lower time limit
     late, seed = tmp_path / "late", StartRange(seed=starts)
     write_results(run_protocol([pair], [method], late, starts=1, ranges=seed, time_limit_s=2.0), late, {})
-    lines = [line for folder in (out, late) for line in csv.DictReader((folder / "runs.csv").open())]
+    texts = [(folder / "runs.csv").read_text().splitlines() for folder in (out, late)]
+    lines = [line for text in texts for line in csv.DictReader(text)]
     assert len(lines) == len(TOLD)
     for what, line in enumerate(lines):
         assert line["reason"].startswith(TOLD[what])
@@ -414,8 +417,6 @@ def teaser(tmp_path, monkeypatch):
 
 
 def test_teaser_is_right_and_refuses_where_nothing_agrees(teaser):
-    from mtpcr_geo.benchmark.baselines.fpfh import Features
-
     rng = np.random.default_rng(5)
     xyz = programs.scattered(rng)
 
@@ -429,12 +430,11 @@ def test_teaser_is_right_and_refuses_where_nothing_agrees(teaser):
 
     matches = np.stack([np.arange(len(xyz))] * 2, axis=1)
     moved = transforms.apply(T_TRUE, xyz)
-    answer = methods.make_method("fpfh-teaser:voxel=2").solve(Kept(xyz), Kept(moved), matches, 0)
+    answer = FpfhTeaser(voxel=2).solve(Kept(xyz), Kept(moved), matches, 0)
+    assert answer.T_target_source is not None
     assert np.allclose(answer.T_target_source, T_TRUE)
     assert answer.details["clique"] == 50
-    none = methods.make_method("fpfh-teaser:voxel=2,clique_limit_s=3").solve(
-        Kept(xyz), Kept(moved), matches, 0
-    )
+    none = FpfhTeaser(voxel=2, clique_limit_s=3).solve(Kept(xyz), Kept(moved), matches, 0)
     assert (none.T_target_source, none.verdict) == (None, "refused")
     assert "no two" in none.reason
 
@@ -465,13 +465,14 @@ def test_telling_lines():
     assert told("step 1\r\nerror: too few planes\nregistration failed\nlast") == (
         "error: too few planes; registration failed"
     )
+    assert told("reading\ntwo few planes\nregistration failed\n") == "two few planes; registration failed"
     many = "\n".join(f"cannot do {k}" for k in range(9))
     assert told(many) == "cannot do 0; cannot do 1; cannot do 8"
     trace = (
         "Traceback (most recent call last):\n  File 'x'\nlib.CustomError: it broke\nException ignored in x"
     )
     assert told(trace) == "lib.CustomError: it broke"
-    assert told("no errors reported here") == "no errors reported here"
+    assert told("working\nno errors reported here") == "no errors reported here"
 
 
 def test_much_that_is_printed_loses_its_middle(tmp_path):

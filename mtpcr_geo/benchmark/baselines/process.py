@@ -132,6 +132,10 @@ def telling_lines(printed: str) -> str:
         if raised:
             return raised[-1][:_LONGEST]
     telling = list(dict.fromkeys(line for line in lines if _TELLING.search(line)))
+    if len(telling) == 1:
+        # what says no more than that it failed often follows on the cause
+        place = lines.index(telling[0])
+        telling = lines[max(0, place - 1) : place + 1]
     # the first is nearest to the cause, the last nearest to the end
     chosen = telling[:2] + ([telling[-1]] if len(telling) > 2 else [])
     return "; ".join(line[:_LONGEST] for line in chosen or lines[-1:])
