@@ -70,8 +70,8 @@ def reasons_of(change: dict) -> str:
     ("change", "texts"),
     [
         ({"margin": 1.2996}, ["margin 1.2996, wanted 1.3"]),
-        ({"null_ratio": 1.299}, ["1.299 times", "wanted 1.3"]),
-        ({"null_ratio": 0.8}, ["less well than the mirrored", "0.80 times, wanted 1.3"]),
+        ({"null_ratio": 1.799}, ["1.799 times", "wanted 1.8"]),
+        ({"null_ratio": 0.8}, ["less well than the mirrored", "0.80 times, wanted 1.8"]),
         ({"ground_agreeing": 629}, ["69.9 % of the ground", "wanted 70 %", "900 cells"]),
         ({"overlap_m2": 399.9}, ["only 399.9 m2", "wanted 400", "20% of the source"]),
         ({"refined_away_m": 2.01}, ["went 2.01 m away", "at most 2 m"]),

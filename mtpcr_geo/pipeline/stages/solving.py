@@ -260,7 +260,7 @@ class AssessOptions(StageOptions):
         description="where no probability is known: share of held-out tie points that must agree to accept",
     )
     null_ratio: float = Field(
-        1.3, ge=0, description="strength over the best of the mirrored source wanted to accept"
+        1.8, ge=0, description="strength over the best of the mirrored source wanted to accept"
     )
     min_overlap: float | None = Field(
         None,
