@@ -41,6 +41,9 @@ UPRIGHT = 1e-9
 CLEARLY = 1.01
 """Times that the residual after ICP must exceed a start's for the start to be taken: on bare, sparse ground
 they are equal but for chance, and results would jump with it."""
+MUCH = 0.9
+"""Share of the residual of a run of ICP that kept the tie points, below which another that lost them is told:
+along rows of trees or panels a far run ends a period away, and fits as well there or a little better."""
 
 
 @dataclass(frozen=True)
@@ -304,7 +307,8 @@ def follow_icp(
     lost = [
         name
         for name in runs
-        if name not in kept and trials[name].surface_residual < trials[best].surface_residual
+        if name not in kept
+        and trials[name].surface_residual < trials[best].surface_residual * (MUCH if best in runs else 1.0)
     ]
     if (
         best in runs
