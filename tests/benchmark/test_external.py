@@ -462,6 +462,7 @@ def test_telling_lines():
     told = process.telling_lines
     assert told("") == ""
     assert told("one\n\ntwo\n") == "two"
+    assert told("\x1b[1;33m[Warning] large\nset it\x1b[0m\n\x1b[0m") == "set it"
     assert told("step 1\r\nerror: too few planes\nregistration failed\nlast") == (
         "error: too few planes; registration failed"
     )

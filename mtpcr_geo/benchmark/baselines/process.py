@@ -31,6 +31,7 @@ _TELLING = re.compile(
 )
 # the last line of a traceback: a dotted name, and what it says
 _RAISED = re.compile(r"(?:\w+\.)*[A-Z]\w*(?:Error|Exception|Interrupt|Exit|Warning)\b(?::.*)?")
+_COLOUR = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 _TRACEBACK = "Traceback (most recent call last):"
 _LONGEST = 300
 
@@ -123,7 +124,9 @@ def telling_lines(printed: str) -> str:
 
     The last line alone often says only that it failed. Where no line speaks of a failure, the last is taken.
     """
-    lines = [line.strip() for line in re.split(r"[\r\n]+", printed) if line.strip()]
+    lines = [
+        line for line in (text.strip() for text in re.split(r"[\r\n]+", _COLOUR.sub("", printed))) if line
+    ]
     if not lines:
         return ""
     if _TRACEBACK in lines:
