@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -72,7 +73,7 @@ def apply_transform(
     cloud = open_any(in_path, text=text)
     out_path = Path(out_path)
     for read in (cloud.path, Path(in_path), Path(transform_path)):
-        if out_path.exists() and read.is_file() and out_path.samefile(read):
+        if os.path.exists(out_path) and os.path.isfile(read) and out_path.samefile(read):
             raise InputError(f"{out_path} is input and output at once; write to another file")
     moved = moved_by(chain, cloud, inverse=inverse)
     far = far_text(chain, cloud, inverse=inverse)
@@ -228,7 +229,7 @@ def write_moved(
         clouds = moved.base.parts
         names = output_names([Path(part.name) for part in clouds])
         parts = [(out_path / name, part) for name, part in zip(names, clouds, strict=True)]
-        if out_path.is_file() or out_path.suffix.lower() in ENDINGS:
+        if os.path.isfile(out_path) or out_path.suffix.lower() in ENDINGS:
             files = "1 file is" if len(parts) == 1 else f"{len(parts)} files are"
             raise InputError(f"{out_path} is a file by its name, and {files} moved to a folder; name one")
     else:

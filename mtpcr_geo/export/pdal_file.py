@@ -12,6 +12,7 @@ import numpy as np
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
+from mtpcr_geo.core.paths import real
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.export.transform import dumps
 from mtpcr_geo.io.file_cloud import FileCloud
@@ -66,9 +67,9 @@ def _reader(cloud: Cloud, folder: Path) -> dict[str, Any]:
 
 def _seen_from(folder: Path, path: Path) -> str:
     try:
-        return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+        return Path(os.path.relpath(real(path), real(folder))).as_posix()
     except ValueError:  # on another drive
-        return path.resolve().as_posix()
+        return real(path).as_posix()
 
 
 def _writer(cloud: Cloud, chain: TransformChain) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import numpy as np
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import InputError
+from mtpcr_geo.core.paths import read_whole
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.export.transform import KIND, read_transform
 
@@ -37,7 +38,7 @@ def read_pose(path: Path) -> TransformChain | Floats:
 
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_whole(path).decode("utf-8-sig")
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}; name a file with a 4x4") from error
     except UnicodeDecodeError as error:
@@ -50,7 +51,10 @@ def read_pose(path: Path) -> TransformChain | Floats:
     except ValueError as error:
         raise InputError(f"{path} is no 4x4 ({error}); {_ROWS}") from error
     T = matrix_of(numbers, str(path))
-    shifts = [_shift(text, role) for role in ("source", "target")]
+    try:
+        shifts = [_shift(text, role) for role in ("source", "target")]
+    except ValueError as error:
+        raise InputError(f"{path} states a global shift that is none ({error})") from error
     return np.asarray(transforms.translation(-shifts[1]) @ T @ transforms.translation(shifts[0]))
 
 

@@ -15,6 +15,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.core.frames import FrameLink, OperationReport, Vertical
+from mtpcr_geo.core.paths import read_whole
 from mtpcr_geo.core.scanner import Scanner
 from mtpcr_geo.core.units import Axes, Unit
 from mtpcr_geo.core.wording import visible
@@ -126,7 +127,7 @@ def read_transform(path: str | Path) -> TransformChain:
     """
     path = Path(path)
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(read_whole(path))
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}; name a transform.json") from error
     except RecursionError as error:
@@ -178,7 +179,7 @@ def doubts_of(path: str | Path) -> str | None:
         path: the file, which `read_transform` takes.
 
     """
-    stated = json.loads(Path(path).read_text(encoding="utf-8")).get("verdict")
+    stated = json.loads(read_whole(path)).get("verdict")
     if not isinstance(stated, dict) or stated.get("name") in (None, "accepted"):
         return None
     reasons = stated.get("reasons")

@@ -14,6 +14,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from mtpcr_geo.core.paths import real
+
 _NAME = ".mtpcr-geo-{}.journal"
 _NAMED = re.compile(r"\.mtpcr-geo-(\d{1,10})\.(journal|new)")
 _PART = re.compile(r"\..+\.part-(\d{1,10})(\.[^./\\]*)?")
@@ -84,7 +86,7 @@ class Journal:
 def folder_of(paths: Iterable[Path]) -> dict[Path, list[Path]]:
     """Group files by the folder where their journal stands: one for all, unless they lie far apart."""
     files = list(paths)
-    parents = {path: path.parent.resolve() for path in files}
+    parents = {path: real(path.parent) for path in files}
     if not files:
         return {}
     try:
@@ -108,7 +110,7 @@ def finish_left(folder: Path) -> None:
         OSError: if a file cannot be put in place.
 
     """
-    folder = folder.resolve()
+    folder = real(folder)
     for place in (folder, *list(folder.parents)[:2]):
         for path in _listed(place):
             found = _NAMED.fullmatch(path.name)
@@ -193,8 +195,8 @@ def _below(journal: Path, name: Any) -> Path:
     """
     if not isinstance(name, str):
         raise TypeError("not a name")
-    folder = journal.parent.resolve()
+    folder = real(journal.parent)
     path = folder / name
-    if path.is_symlink() or ".." in Path(name).parts or not path.resolve().is_relative_to(folder):
+    if path.is_symlink() or ".." in Path(name).parts or not real(path).is_relative_to(folder):
         raise ValueError(f"{name} lies elsewhere")
     return path

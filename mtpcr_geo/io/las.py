@@ -18,6 +18,7 @@ from laspy import DecompressionSelection as Fields
 from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 from mtpcr_geo.core.errors import InputError
+from mtpcr_geo.core.paths import real
 from mtpcr_geo.core.system import sha256
 from mtpcr_geo.io.dimensions import las_table, noise_of_record
 from mtpcr_geo.io.las_header import Head, Overlaid
@@ -187,6 +188,9 @@ def open_cloud(path: str | Path, crs: CRS | None = None) -> LasCloud:
         raise InputError(f"{path} does not exist; check the path")
     if path.is_dir():
         raise InputError(f"{path} is a folder; name a LAS, LAZ or COPC file")
+    if not path.is_file():
+        # a pipe would be waited for
+        raise InputError(f"{path} is no regular file, and clouds are read more than once; save it as one")
     with _reported(path), path.open("rb") as stream:
         if stream.read(4) != b"LASF":
             raise InputError(f"{path} is not a LAS, LAZ or COPC file (it does not begin with LASF)")
@@ -232,7 +236,7 @@ def _damaged(path: Path, error: BaseException) -> InputError:
 def _files(cloud: Cloud) -> list[Path]:
     """Return the files of a cloud, one or many, resolved; none of a cloud in memory."""
     parts = getattr(cloud, "parts", None)
-    return [Path(one.name).resolve() for one in (parts or (cloud,)) if hasattr(one, "path")]
+    return [real(one.name) for one in (parts or (cloud,)) if hasattr(one, "path")]
 
 
 def check_distinct(target: Cloud, source: Cloud) -> None:

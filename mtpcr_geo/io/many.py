@@ -15,6 +15,7 @@ import numpy as np
 from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 from mtpcr_geo.core.errors import CrsError, InputError
+from mtpcr_geo.core.paths import fault_of, read_whole, short
 from mtpcr_geo.crs.facts import same_place
 from mtpcr_geo.io.file_cloud import FileCloud
 
@@ -85,8 +86,16 @@ def _refilled(rows: Iterator[tuple[np.ndarray, ...]], size: int) -> Iterator[tup
 
 
 def is_many(path: str | Path) -> bool:
-    """Return whether a path names several files: a folder, a pattern, a ``.vpc``, or ``@`` and a list."""
+    """Return whether a path names several files: a folder, a pattern, a ``.vpc``, or ``@`` and a list.
+
+    Raises:
+        InputError: if no file can have that name.
+
+    """
     text = str(path)
+    fault = fault_of(text.removeprefix(LIST_MARK))
+    if fault:
+        raise InputError(f"the name {short(text)} {fault}")
     found = Path(path)
     if found.is_dir() or text.startswith(LIST_MARK):
         return True
@@ -176,7 +185,7 @@ def output_names(files: Sequence[Path]) -> list[str]:
 
 def _listed(path: Path) -> list[Path]:
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_whole(path).decode("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
             f"cannot read the list {path} ({error}); give a text file with a path a line"
@@ -187,9 +196,9 @@ def _listed(path: Path) -> list[Path]:
 
 def _of_vpc(path: Path) -> list[Path]:
     try:
-        features = json.loads(path.read_text(encoding="utf-8"))["features"]
+        features = json.loads(read_whole(path))["features"]
         places = [_local(_data_of(one["assets"])["href"]) for one in features]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration, RecursionError) as error:
         raise InputError(
             f"{path} is no virtual point cloud ({type(error).__name__}: {error}); make it anew"
         ) from error

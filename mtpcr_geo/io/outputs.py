@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from mtpcr_geo.core.errors import OutputError
+from mtpcr_geo.core.paths import fault_of, short
 from mtpcr_geo.io.journal import Journal, finish_left, folder_of, remove_left
 
 
@@ -57,6 +58,10 @@ class OutputSet:
             OutputError: if the file exists and may not be replaced, or its folder cannot be written.
 
         """
+        # the temporary name is the longer one
+        fault = fault_of(_part_of(final))
+        if fault:
+            raise OutputError(f"the name {short(final)} {fault}; choose another one")
         self._finish_left(final.parent)
         if final.is_dir():
             raise OutputError(f"{final} is a folder; name a file to write")
@@ -93,7 +98,7 @@ class OutputSet:
         except OSError as error:
             raise OutputError(f"cannot make the folder {final.parent}: {error.strerror}") from error
         # the suffix stays last: drivers choose the format by it
-        part = final.with_name(f".{final.stem}.part-{os.getpid()}{final.suffix}")
+        part = _part_of(final)
         remove_left(part)
         self._parts[final] = part
         return part
@@ -239,6 +244,10 @@ def _finish(journals: list[Journal]) -> None:
                 ) from error
     if interrupted is not None:
         raise interrupted
+
+
+def _part_of(final: Path) -> Path:
+    return final.parent / f".{final.stem}.part-{os.getpid()}{final.suffix}"
 
 
 def _pattern(template: Path) -> str:

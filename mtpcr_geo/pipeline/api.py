@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import InputError, OptionError
+from mtpcr_geo.core.paths import read_whole
 from mtpcr_geo.core.progress import Progress
 from mtpcr_geo.io.memory import cloud_of
 from mtpcr_geo.pipeline import grammar
@@ -254,7 +255,7 @@ def read_text(path: str | Path) -> bytes:
 
         return sys.stdin.buffer.read()
     try:
-        return Path(path).read_bytes()
+        return read_whole(path)
     except OSError as error:
         raise InputError(f"cannot read the pipeline {path}: {error.strerror}") from error
 

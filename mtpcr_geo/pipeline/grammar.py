@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import glob
 import json
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from mtpcr_geo.core.errors import OptionError
@@ -337,7 +337,7 @@ def _readers(element: Element, taken: set[str]) -> list[StageSpec]:
     files: list[str] = []
     # the reader of any format takes a pattern itself, as one cloud
     pattern = element.type != ANY_READER and filename and _GLOB.search(filename)
-    if filename and pattern and not Path(filename).exists():
+    if filename and pattern and not os.path.exists(filename):
         files = sorted(glob.glob(filename))
         if not files:
             raise OptionError(f"{element.label}: no file fits the pattern {filename!r}")

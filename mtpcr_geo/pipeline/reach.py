@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.paths import real
 from mtpcr_geo.pipeline.grammar import StageSpec
 
 _REMOTE = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)
@@ -112,11 +113,11 @@ def _json_in(text: str) -> Any:
 def _named_by(path: Path, seen: set[Path]) -> tuple[Path, str] | None:
     """Return the file that names something remote, this one or one that it names, and what; or None."""
     try:
-        real = path.resolve()
-        if real in seen or not real.is_file() or len(seen) > 1000:
+        target = real(path)
+        if target in seen or not target.is_file() or len(seen) > 1000:
             return None
-        seen.add(real)
-        with real.open("rb") as file:
+        seen.add(target)
+        with target.open("rb") as file:
             head = file.read(_LOOK_BYTES)
     except (OSError, ValueError):
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -82,7 +83,7 @@ class InputFile:
         """
         from mtpcr_geo.core.system import sha256
 
-        if not self.path.is_file() or InputFile.of(self.path) != replace(self, sha256=None):
+        if not os.path.isfile(self.path) or InputFile.of(self.path) != replace(self, sha256=None):
             raise InputError(f"{self.path} has changed since it was read; run again")
         return self if self.sha256 is not None else replace(self, sha256=sha256(self.path))
 
@@ -152,4 +153,4 @@ class Written:
 
 def input_files(paths: Iterable[Path]) -> tuple[InputFile, ...]:
     """Look at each file once; what is no regular file is left out."""
-    return tuple(InputFile.of(path) for path in dict.fromkeys(paths) if path.is_file())
+    return tuple(InputFile.of(path) for path in dict.fromkeys(paths) if os.path.isfile(path))

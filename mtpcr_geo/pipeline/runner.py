@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -10,6 +11,7 @@ from pathlib import Path
 
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError, RegistrationError
+from mtpcr_geo.core.paths import real, short
 from mtpcr_geo.core.progress import NoProgress, Progress
 from mtpcr_geo.core.system import versions
 from mtpcr_geo.core.types import Pair, Verdict
@@ -224,24 +226,24 @@ def _check(nodes: Sequence[Node], context: RunContext) -> None:
     stages = [node.stage for node in nodes]
     for stage in stages:
         for path in stage.writes():
-            other = writers.setdefault(path.resolve(), stage)
+            other = writers.setdefault(real(path), stage)
             if other is not stage:
                 raise OptionError(
                     f"{stage.label} and {other.label} both write {path}; give each its own file"
                 )
     for stage in stages:
         for path in stage.reads():
-            if path.resolve() in writers:
-                writer = writers[path.resolve()]
+            if real(path) in writers:
+                writer = writers[real(path)]
                 raise OptionError(f"{writer.label} would write over {path}, which {stage.label} reads")
     for file in context.facts.inputs:
-        if file.path.resolve() in writers:
-            writer = writers[file.path.resolve()]
+        if real(file.path) in writers:
+            writer = writers[real(file.path)]
             raise OptionError(f"{writer.label} would write over {file.path}, which the run has read")
     for stage in stages:
         for path in stage.reads():
-            if not path.exists():
-                raise InputError(f"{stage.label}: there is no file {path}")
+            if not os.path.exists(path):
+                raise InputError(f"{stage.label}: there is no file {short(path)}")
         for path in stage.writes():
             context.outputs.check(path)
         stage.check(context)

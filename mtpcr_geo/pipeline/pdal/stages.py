@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -64,9 +65,11 @@ class PdalStage(Stage):
     def check(self, context: RunContext) -> None:
         """Let PDAL prepare everything up to this stage, without running it."""
         for path in self.reads():
-            if path.is_dir():
+            if os.path.isdir(path):
                 hint = "; name the ept.json in it" if self.spec.type == "readers.ept" else "; name a file"
                 raise InputError(f"{self.label}: {path} is a folder{hint}")
+            if os.path.exists(path) and not os.path.isfile(path):
+                raise InputError(f"{self.label}: {path} is no regular file; save it as one")
         chain: dict[str, dict[str, Any]] = {}
         guessed = self._prepared(chain)
         # processes of PDAL's wait for the next stage as long as the run
