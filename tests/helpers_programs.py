@@ -107,7 +107,7 @@ TORCH = """
             return self
         def detach(self):
             return self
-        cpu = detach
+        cpu = contiguous = detach
         def numpy(self):
             return self.data
         def tolist(self):

@@ -62,8 +62,8 @@ def main() -> None:
     torch.manual_seed(options.seed)
     device = options.device or ("cuda" if torch.cuda.is_available() else "cpu")
     if device == "cpu":
-        # its layers call this wherever they make a tensor
-        torch.Tensor.cuda = lambda self, *arguments, **more: self
+        # its layers call this wherever they make a tensor, and count on a copy without strides
+        torch.Tensor.cuda = lambda self, *arguments, **more: self.contiguous()
     from config import make_cfg
     from geotransformer.utils.data import (
         calibrate_neighbors_stack_mode,
