@@ -36,7 +36,7 @@ def sentence_of(
         # what it fails by; the advice that follows it stands with the reasons
         judged = reasons[0].partition("; ")[0]
         if chance and "probability" not in judged:
-            judged += f", though the evidence as a whole gives {chance} of being within 5 degrees and 2 m"
+            judged += f", though without regard to that the evidence gives {chance} of being right"
     return f"{name.capitalize()}: {judged}; {_accuracy(name, uncertainty, mapped)}."
 
 
