@@ -218,6 +218,7 @@ class Matches(ComparesArrays):
         strength: of the best hypothesis, score times support; None from matchers that have none.
         null_ratio: strength of the best hypothesis over the best of the mirrored source; None likewise.
         mirrored_strengths: strengths of the mirrored source's hypotheses; None where it was not searched.
+        repeats: whether the scene under the best hypothesis fits itself after a shift, as rows do.
         report: further figures of the matcher, for the audit only.
         source_keypoints, target_keypoints: (k, 2) pixels of all keypoints, matched or not; None from
             matchers that have none.
@@ -236,6 +237,7 @@ class Matches(ComparesArrays):
     null_ratio: float | None = None
     strength: float | None = None
     mirrored_strengths: tuple[float, ...] | None = None
+    repeats: bool = False
     report: Mapping[str, Any] = field(default_factory=dict)
     source_keypoints: Floats | None = None
     target_keypoints: Floats | None = None

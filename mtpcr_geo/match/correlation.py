@@ -130,6 +130,7 @@ def match(
         null_ratio=null_ratio,
         strength=best.strength,
         mirrored_strengths=None if twin is None else tuple(c.strength for c in twin.pool.candidates),
+        repeats=search.repeats(),
         report=report,
     )
 
