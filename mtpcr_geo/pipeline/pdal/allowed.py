@@ -2,8 +2,8 @@
 
 An allow list: what it does not name is refused unless code is allowed. So no option of another PDAL, and none
 that PDAL does not list itself (``plugin`` loads any shared library), is let through for not being known. Left
-out on purpose are ``log``, ``option_file``, ``reader_args`` (options of other stages, past every check), and the
-options that write files outside the set of outputs.
+out on purpose are ``log``, ``option_file``, ``reader_args`` (options of other stages,
+past every check), and the options that write files outside the set of outputs.
 """
 
 from __future__ import annotations
