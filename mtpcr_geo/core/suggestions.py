@@ -75,6 +75,7 @@ SYNONYMS: Mapping[str, tuple[str, ...]] = {
 """Names that users of other tools write, by what they may mean here; the first that is valid counts, with
 those that share its last part (so ``crs`` means both ``source-crs`` and ``target-crs``)."""
 
+_LONGEST = 100  # letters; what is longer is no name written wrongly, and takes long to compare
 _LEAST = 0.55
 _LISTED = 12
 
@@ -91,7 +92,7 @@ def suggestions(word: str, valid: Iterable[str]) -> list[str]:
     """
     names = list(dict.fromkeys(valid))
     parts = _parts(word)
-    if not parts:
+    if not parts or len(word) > _LONGEST:
         return []
     by_form = {_form(name): name for name in reversed(names)}
     same = by_form.get("-".join(parts))

@@ -124,3 +124,8 @@ def test_synonyms_are_written_as_they_are_looked_up():
     assert all(word.isalpha() and word.islower() for word in SYNONYMS)
     assert list(SYNONYMS) == sorted(SYNONYMS)
     assert all(word not in meanings for word, meanings in SYNONYMS.items())
+
+
+def test_a_word_of_many_letters_is_like_nothing():
+    assert suggestions("a" * 101, ["a" * 100]) == []
+    assert suggestions("a" * 99, ["a" * 100]) == ["a" * 100]

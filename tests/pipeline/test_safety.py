@@ -49,7 +49,7 @@ def test_stages_that_run_code_or_that_nobody_knows_are_refused(kind):
 
 def test_every_option_that_pdal_lists_is_allowed_or_left_out_on_purpose(pdal):
     left_out = {
-        "log", "option_file",
+        "log", "option_file", "reader_args",
         # written beside the set of outputs
         "density", "dir", "bundledfile",
     }  # fmt: skip

@@ -2,7 +2,8 @@
 
 An allow list: what it does not name is refused unless code is allowed. So no option of another PDAL, and none
 that PDAL does not list itself (``plugin`` loads any shared library), is let through for not being known. Left
-out on purpose are ``log``, ``option_file``, and the options that write files outside the set of outputs.
+out on purpose are ``log``, ``option_file``, ``reader_args`` (options of other stages,
+past every check), and the options that write files outside the set of outputs.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ _OPTIONS = {
     "readers.pgpointcloud": "connection table schema column where srid",
     "readers.stac": (
         "asset_names date_ranges bounds ogr items catalogs collections validate_schema properties "
-        "reader_args catalog_schema_url collection_schema_url feature_schema_url threads header query"
+        "catalog_schema_url collection_schema_url feature_schema_url threads header query"
     ),
     "readers.slpk": "bounds threads dimensions min_density max_density",
     "readers.tiledb": (
