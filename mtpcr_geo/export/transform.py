@@ -306,6 +306,10 @@ def _link(link: FrameLink) -> dict[str, Any]:
     }
 
 
+FACTOR_LIMIT, ORIGIN_LIMIT = 1e9, 1e15
+"""Metres a unit, or units a metre, and coordinates beyond which a transform file is damaged."""
+
+
 def _read_link(data: Mapping[str, Any]) -> FrameLink:
     from pyproj import CRS
     from pyproj.exceptions import CRSError
@@ -319,10 +323,15 @@ def _read_link(data: Mapping[str, Any]) -> FrameLink:
     pipeline = data["pipeline"]
     if pipeline is not None and not isinstance(pipeline, str):
         raise TypeError("pipeline is not text")
+    origin, factor = _array(data["origin"], (3,)), _array(data["factor"], (3,))
+    if not ((factor > 1.0 / FACTOR_LIMIT) & (factor < FACTOR_LIMIT)).all():
+        raise ValueError(f"its factor {factor.tolist()} is that of no unit")
+    if (np.abs(origin) > ORIGIN_LIMIT).any():
+        raise ValueError(f"its origin {origin.tolist()} is no place")
     return FrameLink(
         file_crs=crs,
-        origin=_array(data["origin"], (3,)),
-        factor=_array(data["factor"], (3,)),
+        origin=origin,
+        factor=factor,
         pipeline=pipeline,
         bounds=None if data["bounds"] is None else _array(data["bounds"], (2, 3)),
         report=_read_report(data["report"]),
