@@ -7,7 +7,7 @@ import numpy as np
 
 from mtpcr_geo.core.arrays import Image
 from mtpcr_geo.match.pose import Pose, warp_to
-from mtpcr_geo.match.search import FILLED, Layer, target_under
+from mtpcr_geo.match.search import FILLED, Layer, spectrum, target_under
 
 REPEATS = 0.4
 """Correlation of a scene with itself, moved, from which it repeats itself. Nine real sites have 0.19-0.28;
@@ -67,20 +67,15 @@ def _second_peak(height: Image, steps: Image, mask: Image) -> float:
     """Return the highest correlation of an image with itself beyond the lobe around no shift."""
     rows, columns = (cv2.getOptimalDFTSize(2 * n - 1) for n in mask.shape)
 
-    def spectrum(image: Image) -> Image:
-        padded = np.zeros((rows, columns), np.float32)
-        padded[: image.shape[0], : image.shape[1]] = image
-        return np.asarray(cv2.dft(padded, nonzeroRows=image.shape[0]), np.float32)
-
     def correlated(a: Image, b: Image) -> Image:
         product = cv2.mulSpectrums(a, b, 0, conjB=True)
         found = cv2.idft(product, flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)
         return np.asarray(np.fft.fftshift(found), np.float32)
 
-    filled = spectrum(mask)
+    filled = spectrum(mask, (rows, columns))
     likeness = np.zeros((rows, columns), np.float32)
     for image in (height, steps):
-        one, squares = spectrum(image), spectrum(image**2)
+        one, squares = (spectrum(one, (rows, columns)) for one in (image, image**2))
         norm = correlated(squares, filled) * correlated(filled, squares)
         # float32 sums of a whole image leave a trace where there is nothing
         floor = 1e-6 * float((image**2).sum()) ** 2 + 1e-12

@@ -86,7 +86,7 @@ class GlobalSearch:
         side = int(np.ceil(np.hypot(*source.grid.shape))) + 2
         self._turned_side = side
         height, width = target.grid.shape
-        self._shape = tuple(cv2.getOptimalDFTSize(n + side - 1) for n in (height, width))
+        self._shape = (cv2.getOptimalDFTSize(height + side - 1), cv2.getOptimalDFTSize(width + side - 1))
         self._target_spectra = self._spectra(target.channels.stack)
         self._allowed: Callable[[float], NDArray[np.bool_]] | None = None
 
@@ -118,13 +118,7 @@ class GlobalSearch:
 
     def _spectra(self, stack: Image) -> list[Image]:
         """Transform height, steps, mask and the squares of the first two; packed as OpenCV packs them."""
-        rows, columns = self._shape
-        spectra = []
-        for image in (*stack, stack[0] ** 2, stack[1] ** 2):
-            padded = np.zeros((rows, columns), np.float32)
-            padded[: image.shape[0], : image.shape[1]] = image
-            spectra.append(cv2.dft(padded, nonzeroRows=image.shape[0]))
-        return spectra
+        return [spectrum(image, self._shape) for image in (*stack, stack[0] ** 2, stack[1] ** 2)]
 
     def _turned(self, yaw: float) -> tuple[Image, Grid]:
         """Turn the source about its centre onto a square grid large enough for any yaw."""
@@ -187,6 +181,13 @@ class GlobalSearch:
                 poses += found
                 advance(1)
         return sorted(poses, key=lambda pose: -pose.score)
+
+
+def spectrum(image: Image, shape: tuple[int, int]) -> Image:
+    """Return the transform of an image padded with zeros to a shape; packed as OpenCV packs it."""
+    padded = np.zeros(shape, np.float32)
+    padded[: image.shape[0], : image.shape[1]] = image
+    return np.asarray(cv2.dft(padded, nonzeroRows=image.shape[0]), np.float32)
 
 
 def angle_between(a: float, b: float) -> float:
@@ -278,12 +279,7 @@ def _sums_by_shifts(a: Image, e: Image, m: Image, stack: Image, window: int, ste
 def _sums_by_spectra(a: Image, e: Image, m: Image, stack: Image, window: int) -> Image:
     """Return the same sums from all rows, by the correlation theorem: cheaper where there are many shifts."""
     side = 2 * window + 1
-    shape = tuple(cv2.getOptimalDFTSize(n) for n in stack.shape[1:])
-
-    def spectrum(image: Image) -> Image:
-        padded = np.zeros(shape, np.float32)
-        padded[: image.shape[0], : image.shape[1]] = image
-        return np.asarray(cv2.dft(padded, nonzeroRows=image.shape[0]), np.float32)
+    shape = (cv2.getOptimalDFTSize(stack.shape[1]), cv2.getOptimalDFTSize(stack.shape[2]))
 
     A, E, M = stack
     pairs = ((m, M), (a, A), (e, E), (a * a, M), (e * e, M), (m, A * A), (m, E * E))
@@ -292,7 +288,7 @@ def _sums_by_spectra(a: Image, e: Image, m: Image, stack: Image, window: int) ->
     for number, (one, other) in enumerate(pairs):
         for image in (one, other):
             if id(image) not in known:
-                known[id(image)] = spectrum(image)
+                known[id(image)] = spectrum(image, shape)
         product = cv2.mulSpectrums(known[id(other)], known[id(one)], 0, conjB=True)
         sums[number] = cv2.idft(product, flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)[:side, :side]
     # rounding leaves a trace where nothing overlaps

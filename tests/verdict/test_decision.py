@@ -48,6 +48,9 @@ def test_good_evidence_is_accepted_with_its_grounds() -> None:
         ({"margin": None, "support": None}, "accepted"),
         ({"final_agreeing": 10}, "refused"),
         ({"refinement_lost": True}, "doubtful"),
+        ({"objects_missing": 0.14}, "doubtful"),
+        ({"objects_missing": 0.07}, "accepted"),
+        ({"null_ratio": 1.65}, "doubtful"),
         ({"ground_agreeing": 590}, "doubtful"),
     ],
 )
