@@ -19,7 +19,7 @@ from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import Bev, Hypothesis
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of, warp_to
-from mtpcr_geo.match.search import distinct
+from mtpcr_geo.match.search import distinct, spectrum
 from mtpcr_geo.method.bev import coarsen
 
 NOISE_M = 0.1
@@ -136,8 +136,11 @@ class TerrainSearch:
         self.min_cells = max(min_cells, FEWEST_CELLS)
         self._side = int(np.ceil(np.hypot(*source.grid.shape))) + 2
         height, width = target.grid.shape
-        self._shape = tuple(cv2.getOptimalDFTSize(n + self._side - 1) for n in (height, width))
-        self._target = [self._spectrum(one) for one in (target.mask, target.low, target.low**2)]
+        self._shape = (
+            cv2.getOptimalDFTSize(height + self._side - 1),
+            cv2.getOptimalDFTSize(width + self._side - 1),
+        )
+        self._target = [spectrum(one, self._shape) for one in (target.mask, target.low, target.low**2)]
         self._near: tuple[Callable[[float], tuple[float, float]], float] | None = None
 
     def restrict(self, place: Callable[[float], tuple[float, float]], radius: float) -> None:
@@ -150,11 +153,6 @@ class TerrainSearch:
         """
         self._near = place, radius + self.target.grid.cell
 
-    def _spectrum(self, image: Image) -> Image:
-        padded = np.zeros(self._shape, np.float32)
-        padded[: image.shape[0], : image.shape[1]] = image
-        return np.asarray(cv2.dft(padded, nonzeroRows=image.shape[0]), np.float32)
-
     def best(self, yaw: float) -> list[tuple[Pose, float]]:
         """Return the best shifts under one yaw, by evidence and by closeness, each with its closeness."""
         grid = self.target.grid
@@ -165,7 +163,7 @@ class TerrainSearch:
         )
         mask = (mask > KNOWN).astype(np.float32)
         low = low * mask
-        m, a, aa = (self._spectrum(one) for one in (mask, low, low**2))
+        m, a, aa = (spectrum(one, self._shape) for one in (mask, low, low**2))
         M, A, AA = self._target
         n, sa, saa, ta, taa, cross = (
             cv2.idft(cv2.mulSpectrums(t, s, 0, conjB=True), flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)

@@ -219,11 +219,10 @@ def cross_validated(tie_points: TiePoints, tolerance: float, settings: SolveSett
 
 
 def _refined_away(pair: Pair, T: Floats) -> float:
-    """How far the refinement moved the middle of the tie points in plan, metres.
+    """Return how far the refinement moved the middle of the tie points in plan, metres.
 
     Height is not counted: tie points are matched in plan, and take theirs from levelled rasters, which a
-        degree
-    of tilt raises by metres. That of the result is judged by the ground.
+    degree of tilt raises by metres. That of the result is judged by the ground.
     """
     before = pair.refinement.T_before if pair.refinement is not None else None
     if before is None or pair.tie_points is None or not len(pair.tie_points.source):
