@@ -18,6 +18,7 @@ from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Matches
 from mtpcr_geo.match.exploration import (
+    CLEAR_LEAD,
     CONVINCING_NULL_RATIO,
     MIRRORED_HYPOTHESES,
     CorrelationSettings,
@@ -79,9 +80,15 @@ def match(
         settled = search.settles()
         if settled and (twin is None or search.asked_terrain):
             break
-        if twin is not None and (settled or (search.asked_terrain and search.promises())):
+        if twin is None:
+            continue
+        if settled or (search.asked_terrain and search.promises()):
             twin.catch_up(search)
             if search.pool.over(twin.pool) >= CONVINCING_NULL_RATIO:
+                break
+        elif search.leads():
+            twin.catch_up(search)
+            if search.pool.over(twin.pool) >= CLEAR_LEAD:
                 break
     pool = search.pool
     if not pool.candidates:

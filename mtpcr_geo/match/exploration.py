@@ -41,6 +41,9 @@ spread them so, and so does another row of the same houses."""
 PROMISING_NEG_LOG10_P, CONVINCING_NULL_RATIO = 4.0, 2.0
 """Significance from which the mirrored source is asked before finer levels are searched, and the strength
 over it that ends the search: wrong poses have reached 1.5."""
+CLEAR_LEAD = 3.0
+"""Strength over the next distinct pose, and over the mirrored source's best, that ends the search of a scene
+that does not repeat itself before the terrain is asked."""
 
 
 @dataclass(frozen=True)
@@ -282,6 +285,10 @@ class Exploration:
             and self.pool.margin >= self.settings.convincing_margin
             and self.pool.candidates[0].neg_log10_p >= PROMISING_NEG_LOG10_P
         )
+
+    def leads(self) -> bool:
+        """Return whether the best hypothesis stands out so far that the mirrored source alone may end it."""
+        return self.promises() and self.pool.margin >= CLEAR_LEAD and not self.repeats()
 
     def _yaw_step(self, source: Layer) -> float:
         """Step over all yaws, radians: about a cell and a half at the smaller raster's rim."""

@@ -262,17 +262,34 @@ def score_nearby(
 
 
 def _sums_by_shifts(a: Image, e: Image, m: Image, stack: Image, window: int, step: int) -> Image:
-    """Return the (7, n, n) sums that a score is made of, for each shift, from every ``step``-th row."""
+    """Return the (7, n, n) sums that a score is made of, for each shift, from every ``step``-th row.
+
+    The source's rows are filled up with zeros to the length of the target's: a shift is then a place in the
+    target's cells laid end to end, and none is copied for it.
+    """
     rows, columns = m.shape
-    side = 2 * window + 1
-    a, e, m = a[::step].ravel(), e[::step].ravel(), m[::step].ravel()
+    side, width = 2 * window + 1, stack.shape[2]
+    length = (len(range(0, rows, step)) - 1) * width + columns
+    source = np.zeros((5, -(-rows // step), width), np.float32)
+    for row, image in zip(source, (m, a, e, a * a, e * e), strict=True):
+        row[:, :columns] = image[::step]
+    m, a, e, aa, ee = source.reshape(5, -1)[:, :length]
+    A, E, M = stack
+    target = np.stack([M, A, E, A * A, E * E])
     sums = np.empty((7, side, side), np.float32)
-    aa, ee = a * a, e * e
     for dy in range(side):
+        M, A, E, AA, EE = np.ascontiguousarray(target[:, dy : dy + rows : step]).reshape(5, -1)
         for dx in range(side):
-            A, E, M = (c.ravel() for c in stack[:, dy : dy + rows : step, dx : dx + columns])
-            mA, mE = m * A, m * E
-            sums[:, dy, dx] = (m @ M, a @ A, e @ E, aa @ M, ee @ M, mA @ A, mE @ E)
+            at = slice(dx, dx + length)
+            sums[:, dy, dx] = (
+                m @ M[at],
+                a @ A[at],
+                e @ E[at],
+                aa @ M[at],
+                ee @ M[at],
+                m @ AA[at],
+                m @ EE[at],
+            )
     return np.asarray(sums * np.float32(step))
 
 

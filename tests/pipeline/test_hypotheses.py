@@ -64,6 +64,24 @@ def test_no_other_vertical_is_tried_where_the_first_convinces_or_all_are_known()
         assert best.source.levelling is one.source.levelling
 
 
+def test_evidence_of_two_kinds_is_tried_against_that_of_one_even_where_it_convinces() -> None:
+    """A floor that leans on a slope, against a cloud kept as given: matches some degrees off convince too."""
+    pair = turned(T30)
+    pair = pair.with_(source=replace(pair.source, levelling=replace(pair.source.levelling, method="floor")))
+    assert pair.target.levelling.method != "floor"
+
+    def attempt(one: Pair) -> Pair:
+        kinds = {one.source.levelling.method, one.target.levelling.method}
+        return one.with_(matches=found(20.0 if len(kinds) == 1 else 9.0, 3.0, 3.0))
+
+    best, tried = best_vertical(pair, 0, attempt, attempt)
+    assert best.source.levelling.method == best.target.levelling.method
+    assert all(one["source"] == one["target"] for one in tried[1:])
+    # the first is kept where no other is stronger
+    best, _ = best_vertical(pair, 0, attempt, lambda one: one.with_(matches=found(1.0, 3.0, 3.0)))
+    assert best.source.levelling is pair.source.levelling
+
+
 def test_nothing_found_under_one_vertical_is_no_end_and_under_all_is() -> None:
     pair = turned(Y_UP)
 

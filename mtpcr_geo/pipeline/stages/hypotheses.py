@@ -84,7 +84,8 @@ def best_vertical(
 
     Returns:
         The pair under the verticals of the strongest matches, and what was tried, for the audit; nothing
-        there where the first was convincing or both verticals are known.
+        there where both verticals are known, or the first was convincing and both clouds had the same kind
+        of evidence for theirs.
 
     Raises:
         RegistrationError: if there is nothing to match under any.
@@ -93,12 +94,16 @@ def best_vertical(
     if pair.source.levelling.trusted and pair.target.levelling.trusted:
         return first(pair), []
     tried = [_attempted(pair, first)]
-    if not _convincing(tried[0]):
-        for source, target in others(pair, seed)[: MOST_TRIED - 1]:
-            tried.append(_attempted(_under(pair, source, target), attempt))
-            if _convincing(tried[-1]):
-                break
-    best = tried[-1] if _convincing(tried[-1]) else max(tried, key=lambda one: one.length_strength)
+    settled = _convincing(tried[0])
+    wanted = [] if settled and not _of_two_kinds(pair) else others(pair, seed)
+    if settled:
+        wanted = [(source, target) for source, target in wanted if source.method == target.method]
+    for source, target in wanted[: MOST_TRIED - 1]:
+        tried.append(_attempted(_under(pair, source, target), attempt))
+        if not settled and _convincing(tried[-1]):
+            break
+    found = tried if settled or not _convincing(tried[-1]) else tried[-1:]
+    best = max(found, key=lambda one: one.length_strength)
     if best.failure is not None:
         raise best.failure
     return best.pair, [one.audit(one is best) for one in tried] if tried[1:] else []
@@ -129,6 +134,16 @@ def others(pair: Pair, seed: int) -> list[tuple[Levelling, Levelling]]:
 
 def _same(one: tuple[Levelling, Levelling], other: tuple[Levelling, Levelling]) -> bool:
     return all(angle_deg(_up(a), _up(b)) <= SAME_VERTICAL_DEG for a, b in zip(one, other, strict=True))
+
+
+def _of_two_kinds(pair: Pair) -> bool:
+    """Whether both clouds stand by different kinds of evidence, neither of which is known to be right.
+
+    What both clouds show of their verticals then contradicts itself: on a slope that only one of them sees
+    well its floor leans, and a pose some degrees off may still convince.
+    """
+    levellings = (pair.source.levelling, pair.target.levelling)
+    return not any(one.trusted for one in levellings) and levellings[0].method != levellings[1].method
 
 
 def _may_be(side: Side, other: Levelling) -> bool:
