@@ -75,6 +75,29 @@ def test_every_pair_comes_back_from_any_yaw(name: str, seed: int, shared_data: P
     check(name, shared_data, seed, tmp_path)
 
 
+@pytest.mark.parametrize("name", ["delft_urban_ahn3", "bcts_forest_strips"])
+def test_two_local_clouds_that_both_lean_come_together(name: str, shared_data: Path) -> None:
+    """Nothing tells either vertical: what the ground of each shows differs by the slope that only one sees."""
+    rng = np.random.default_rng(1)
+    clouds, moves = [], []
+    for role, lean in (("source", 5.0), ("target", 7.0)):
+        las = laspy.read(shared_data / name / f"{role}.laz")
+        xyz = np.column_stack([las.x, las.y, las.z])
+        direction = rng.uniform(0, 2 * np.pi)
+        tilt = transforms.tilt_matrix(direction, np.radians(lean))
+        turn = transforms.about(xyz.mean(axis=0), tilt @ transforms.yaw_matrix(rng.uniform(0, 2 * np.pi)))
+        clouds.append(transforms.apply(turn, xyz))
+        moves.append(turn)
+    found = register(*clouds, local=True)
+    truth = moves[1] @ transforms.inverse(moves[0])
+    assert found.verdict.name == "accepted", found.verdict.reasons
+    assert found.T_target_source is not None
+    assert rotation_error_deg(found.T_target_source, truth) < 0.1
+    off, height = centroid_errors(found.T_target_source, truth, clouds[0].mean(axis=0))
+    assert off < 0.3
+    assert abs(height) < 0.25
+
+
 def refuse(a: str, b: str, data: Path, tmp_path: Path) -> None:
     found = register(
         data / a / "source.laz", data / b / "target.laz", tmp_path, local=True, level="none", recording=False

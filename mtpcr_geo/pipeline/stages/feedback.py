@@ -26,6 +26,9 @@ from mtpcr_geo.verdict.evidence import tie_points_agreeing
 LEAST_TILT_DEG = 0.3
 """Tilt left between the levelled clouds from which on a new vertical is worth a second search."""
 MOST_TILT_DEG = 30.0
+WEAKEST, CLOSER = 0.5, 0.8
+"""Share of the first matches' strength that those under a new vertical have at least, and of the surfaces' residual
+that is left at most where they are weaker: of a right one under 0.5 is left."""
 
 
 def levelled_by(pair: Pair, T_target_source: Floats) -> Levelling:
@@ -86,10 +89,12 @@ def fed_back(
         again = _solved(again, pair)
     except RegistrationError:
         return None
-    found, before = again.matches, matches
-    if found is None or (found.strength or 0.0) < (before.strength or 0.0):
-        return None
+    found = again.matches
+    assert found is not None
     assert again.T_target_source is not None
+    strength, before = found.strength or 0.0, matches.strength or 0.0
+    if strength < WEAKEST * before:
+        return None
     refinement = refine(
         again.source.sample,
         again.target.sample,
@@ -98,7 +103,21 @@ def fed_back(
         cell=again.cell,
         agreeing=lambda T: tie_points_agreeing(again, T),
     )
+    if strength < before and not borne_out(refined, refinement):
+        return None
     return again.with_(T_target_source=refinement.T, refinement=refinement)
+
+
+def borne_out(before: Refinement, after: Refinement) -> bool:
+    """Return whether surfaces and tie points, which contradicted each other before, meet under a new vertical.
+
+    Seen from above a scene that leans by some degrees looks much the same: the matches of the right vertical
+    may be a little weaker than those of a wrong one.
+    """
+    if before.icp is None or after.icp is None or not before.icp.lost_tie_points:
+        return False
+    first, last = (one.tried[one.chosen].surface_residual for one in (before.icp, after.icp))
+    return after.icp.followed and not after.icp.lost_tie_points and last <= CLOSER * first
 
 
 def _solved(again: Pair, before: Pair) -> Pair:
