@@ -77,7 +77,7 @@ def test_every_pair_comes_back_from_any_yaw(name: str, seed: int, shared_data: P
 
 @pytest.mark.parametrize("name", ["delft_urban_ahn3", "bcts_forest_strips"])
 def test_two_local_clouds_that_both_lean_come_together(name: str, shared_data: Path) -> None:
-    """Nothing tells either vertical: what the ground of each shows differs by the slope that only one sees."""
+    """Nothing tells either vertical: their grounds differ by the slope that only one sees."""
     rng = np.random.default_rng(1)
     clouds, moves = [], []
     for role, lean in (("source", 5.0), ("target", 7.0)):
@@ -88,7 +88,7 @@ def test_two_local_clouds_that_both_lean_come_together(name: str, shared_data: P
         turn = transforms.about(xyz.mean(axis=0), tilt @ transforms.yaw_matrix(rng.uniform(0, 2 * np.pi)))
         clouds.append(transforms.apply(turn, xyz))
         moves.append(turn)
-    found = register(*clouds, local=True)
+    found = register(clouds[0], clouds[1], local=True)
     truth = moves[1] @ transforms.inverse(moves[0])
     assert found.verdict.name == "accepted", found.verdict.reasons
     assert found.T_target_source is not None

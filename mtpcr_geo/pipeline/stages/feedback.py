@@ -27,8 +27,8 @@ LEAST_TILT_DEG = 0.3
 """Tilt left between the levelled clouds from which on a new vertical is worth a second search."""
 MOST_TILT_DEG = 30.0
 WEAKEST, CLOSER = 0.5, 0.8
-"""Share of the first matches' strength that those under a new vertical have at least, and of the surfaces' residual
-that is left at most where they are weaker: of a right one under 0.5 is left."""
+"""Share of the first matches' strength that those under a new vertical have at least, and of the surfaces'
+residual that is left at most where they are weaker: of a right one under 0.5 is left."""
 
 
 def levelled_by(pair: Pair, T_target_source: Floats) -> Levelling:
@@ -109,7 +109,7 @@ def fed_back(
 
 
 def borne_out(before: Refinement, after: Refinement) -> bool:
-    """Return whether surfaces and tie points, which contradicted each other before, meet under a new vertical.
+    """Return whether surfaces and tie points, in contradiction before, meet under a new vertical.
 
     Seen from above a scene that leans by some degrees looks much the same: the matches of the right vertical
     may be a little weaker than those of a wrong one.
