@@ -435,11 +435,48 @@ class Models(Texts):
         return f"{len(descriptions(self.folder)) > 0 and len(list(inventory(self.folder))) > 0}"
 
 
+class Bags(Drill):
+    """Mutated bags of ROS 1 and ROS 2: an error, or points that are finite."""
+
+    def __init__(self, folder: Path) -> None:
+        from helpers_bags import UPRIGHT, seen, write_bag
+
+        super().__init__(folder)
+        self.T_imu_lidar = UPRIGHT
+        scans = [(stamp, xyz[:40], time[:40]) for stamp, xyz, time in seen(UPRIGHT, 1)[1][:3]]
+        write_bag(folder / "one.bag", 1, scans)
+        write_bag(folder / "two", 2, scans)
+        self.files = [folder / "one.bag", *sorted((folder / "two").iterdir())]
+        self.bases = {path: path.read_bytes() for path in self.files}
+
+    def one(self, seed: int) -> str:
+        from mtpcr_geo.benchmark.graco import read_sequence
+
+        rng = random.Random(seed)
+        path = rng.choice([self.files[0], *self.files])
+        bag = path if path.suffix == ".bag" else path.parent
+        path.write_bytes(mutate(rng, path.name, self.bases[path]))
+        start = time.monotonic()
+        try:
+            xyz = read_sequence(bag, self.T_imu_lidar)
+            ended = "read"
+            if not np.isfinite(xyz).all():
+                raise BadTryError("points that are not finite")
+        except MtpcrError as error:
+            ended = f"refused, {error.exit_code}"
+        finally:
+            path.write_bytes(self.bases[path])
+        if time.monotonic() - start > LONGEST_S:
+            raise BadTryError(f"took {time.monotonic() - start:.0f} s")
+        return f"{path.suffix[1:]}: {ended}"
+
+
 DRILLS: dict[str, Callable[[Path], Drill]] = {
     "files": Files,
     "pipelines": Pipelines,
     "transforms": Transforms,
     "models": Models,
+    "bags": Bags,
 }
 
 

@@ -12,8 +12,10 @@ tipped by 90 degrees; nothing here takes the lidar's z for up.
 from __future__ import annotations
 
 import re
+import sqlite3
+import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +35,21 @@ LARGEST_GAP_S = 0.25
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _PLACES = {"A": "aerial", "G": "ground"}
 _THIN_AT = 4_000_000
+_DAMAGES = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    sqlite3.Error,
+    struct.error,
+)
+"""What rosbags raises besides its own errors where a bag is damaged: it trusts lengths and names in it."""
 
 
 @dataclass(frozen=True)
@@ -184,6 +201,8 @@ def read_sequence(
     if not held:
         raise InputError(f"{bag} holds no points on {points_topic} at times that {truth_topic} covers")
     cloud = np.concatenate(parts)
+    if not np.isfinite(cloud).all():
+        raise InputError(f"{bag} is damaged: {truth_topic} holds poses that are not finite")
     return _thinned(cloud, voxel_m) if voxel_m > 0 else cloud
 
 
@@ -202,6 +221,10 @@ def points_of(message: Any) -> tuple[Floats, Floats]:
     """Unpack a PointCloud2: finite points (n, 3) in the sensor's frame, and their times (n,), seconds.
 
     A field ``time`` (seconds relative to the stamp) is used where there is one.
+
+    Raises:
+        InputError: if the message holds less than it says.
+
     """
     order = ">" if message.is_bigendian else "<"
     fields = {field.name: (order + _TYPES[field.datatype], field.offset) for field in message.fields}
@@ -215,6 +238,11 @@ def points_of(message: Any) -> tuple[Floats, Floats]:
     )
     raw = np.ascontiguousarray(message.data, np.uint8).tobytes()
     used = message.width * message.point_step
+    if used > message.row_step or message.height * message.row_step > len(raw):
+        raise InputError(
+            f"a scan of {message.height} x {message.width} points of {message.point_step} bytes has "
+            f"{len(raw)} bytes of data"
+        )
     rows = [raw[r * message.row_step : r * message.row_step + used] for r in range(message.height)]
     table = np.frombuffer(b"".join(rows), layout)
     xyz = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
@@ -252,18 +280,30 @@ def _messages(reader: Any, bag: Path, topic: str) -> Iterator[Any]:
 @contextmanager
 def _open(bag: Path) -> Iterator[Any]:
     try:
+        from rosbags import rosbag1, rosbag2
         from rosbags.highlevel import AnyReader, AnyReaderError
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, TypesysError, get_typestore
     except ImportError as error:
         raise MissingPartError(
             "GrAco's bags need rosbags, which is not installed; run pip install 'mtpcr-geo[graco]'"
         ) from error
+    damages: tuple[type[Exception], ...] = (
+        AnyReaderError,
+        rosbag1.ReaderError,
+        rosbag2.ReaderError,
+        TypesysError,
+        *_DAMAGES,
+    )
+    with suppress(ImportError):  # what newer rosbags read SQLite with
+        import apsw
+
+        damages += (apsw.Error,)
     try:
         # older ROS 2 bags do not hold the definitions of their messages
         with AnyReader([Path(bag)], default_typestore=get_typestore(Stores.ROS2_FOXY)) as reader:
             yield reader
-    except (AnyReaderError, OSError) as error:
-        raise InputError(f"cannot read the bag {bag}: {error}") from error
+    except damages as error:
+        raise InputError(f"cannot read the bag {bag}: {error or type(error).__name__}") from error
 
 
 def _thinned(xyz: Floats, voxel: float) -> Floats:
