@@ -203,6 +203,8 @@ class Refinement(ComparesArrays):
         icp: what ICP came to, where it ran.
         ground_after: height settled after ICP, where that was asked for.
         equations: of the last round of ICP, in blocks; None where none was followed.
+        slid_m: how far ICP had slid in plan where plan and yaw were left as the tie points have them, metres;
+            None where they were not.
 
     """
 
@@ -212,6 +214,7 @@ class Refinement(ComparesArrays):
     icp: IcpResult | None = None
     ground_after: GroundFit | None = None
     equations: BlockEquations | None = None
+    slid_m: float | None = None
 
     def audit(self) -> dict[str, Any]:
         """Return what each step did, for the audit."""
@@ -220,4 +223,5 @@ class Refinement(ComparesArrays):
             "icp": self.icp,
             "ground_after": self.ground_after,
         }
-        return {name: step.audit() for name, step in steps.items() if step is not None}
+        found: dict[str, Any] = {name: step.audit() for name, step in steps.items() if step is not None}
+        return found if self.slid_m is None else {**found, "slid_m": self.slid_m}

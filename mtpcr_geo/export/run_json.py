@@ -284,6 +284,8 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.refine icp.fine.inliers``: points with a correspondence at its end
 - ``mtpcr.refine icp.fine.converged``: whether it stood still
 - ``mtpcr.refine icp.rotated_deg``: angle by which ICP turned the start
+- ``mtpcr.refine slid_m``: how far ICP had gone in plan from the tie points of a scene that repeats itself,
+  where that was too far and plan and yaw were left as the tie points have them
 - ``mtpcr.refine levelled_again``: whether the source was levelled by the vertical that ICP found, matched and
   solved again; then the figures are those of the second refinement
 - ``mtpcr.refine tilt_deg``: angle between the source's z axis and that vertical

@@ -52,7 +52,8 @@ def equations_of_pair(pair: Pair, ground: CommonGround, tolerance: float) -> Blo
         None where too little agrees to tell.
 
     """
-    equations = pair.refinement.equations if pair.refinement is not None else None
+    refined = pair.refinement
+    equations = None if refined is None or refined.slid_m is not None else refined.equations
     if equations is None and pair.tie_points is not None:
         equations = equations_of_tie_points(pair, pair.tie_points, ground, tolerance)
     return equations

@@ -30,6 +30,8 @@ RARE = {
     "mtpcr.focus why",
     "mtpcr.level <role>.plane_to_verticals_deg",
     "mtpcr.level <role>.verticals_spread_deg",
+    # where the scene repeats itself
+    "mtpcr.refine slid_m",
     # where a vertical that levelling found was corrected
     "mtpcr.refine levelled_again",
     "mtpcr.refine tilt_deg",

@@ -12,7 +12,7 @@ from pydantic import Field
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import OptionError, RegistrationError
-from mtpcr_geo.core.types import Pair, SolveSettings
+from mtpcr_geo.core.types import Pair, Refinement, SolveSettings
 from mtpcr_geo.method.scales import tolerance_for
 from mtpcr_geo.pipeline.options import Motion, Seed
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
@@ -205,7 +205,6 @@ class Refine(Stage):
             pivot=_middle_of_tie_points(pair),
             R_upright=pair.target.T_level_work[:3, :3].T @ pair.source.T_level_work[:3, :3],
         )
-        self.metadata |= refinement.audit()
         trusted = pair.source.levelling.trusted and pair.target.levelling.trusted
         if not trusted and options.feedback:
             again = fed_back(
@@ -213,9 +212,28 @@ class Refine(Stage):
             )
             if again is not None and again.refinement is not None:
                 tilt = again.source.levelling.tilt_deg
+                if options.keep_tie_points:
+                    again = _held(again, again.refinement)
+                assert again.refinement is not None
                 self.metadata |= {"levelled_again": True, "tilt_deg": tilt, **again.refinement.audit()}
                 return again
-        return pair.with_(T_target_source=refinement.T, refinement=refinement)
+        pair = pair.with_(T_target_source=refinement.T, refinement=refinement)
+        if options.keep_tie_points:
+            pair = _held(pair, refinement)
+        assert pair.refinement is not None
+        self.metadata |= pair.refinement.audit()
+        return pair
+
+
+def _held(pair: Pair, refinement: Refinement) -> Pair:
+    """Return the pair refined; where the scene repeats itself, no farther than its tie points allow."""
+    from mtpcr_geo.method.held import SLIDES_CELLS, held_to_tie_points
+
+    middle = _middle_of_tie_points(pair)
+    if pair.matches is not None and pair.matches.repeats and middle is not None:
+        R_level = pair.target.T_level_work[:3, :3]
+        refinement = held_to_tie_points(refinement, middle, R_level, SLIDES_CELLS * pair.cell)
+    return pair.with_(T_target_source=refinement.T, refinement=refinement)
 
 
 def _middle_of_tie_points(pair: Pair) -> Floats | None:
