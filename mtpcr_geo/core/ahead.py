@@ -11,7 +11,7 @@ from mtpcr_geo.core.system import usable_cores
 Item = TypeVar("Item")
 
 
-def ahead(items: Iterator[Item]) -> Iterator[Item]:
+def ahead(items: Iterator[Item]) -> Generator[Item, None, None]:
     """Yield the same items in the same order, each made by another thread while the one before is in use.
 
     One item is made ahead at most, so that no more than two are held. Of a stream of one item, and where

@@ -51,7 +51,7 @@ def test_an_error_comes_where_its_item_would_have_come_and_the_stream_is_closed(
         finally:
             closed.append(True)
 
-    seen = []
+    seen: list[int] = []
     stream = ahead(items())
     with pytest.raises(ValueError, match="damaged"):
         seen.extend(stream)
