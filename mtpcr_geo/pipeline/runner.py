@@ -11,6 +11,7 @@ from pathlib import Path
 
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError, RegistrationError
+from mtpcr_geo.core.imports import import_ahead
 from mtpcr_geo.core.paths import real, short
 from mtpcr_geo.core.progress import NoProgress, Progress
 from mtpcr_geo.core.system import Meter, versions
@@ -173,6 +174,7 @@ def run(
                     inputs=tuple(file.hashed() for file in context.facts.inputs),
                 )
             outputs.keep(file.path for file in context.facts.inputs)
+            import_ahead(name for stage in stages for name in stage.needs)
             for stage in stages:
                 stage.open(context)
             context.recorder.begin(context.facts.audit())

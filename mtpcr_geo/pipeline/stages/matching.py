@@ -139,6 +139,7 @@ class Match(Stage):
     """Find point pairs in the two rasters, at any yaw."""
 
     type: ClassVar[str] = "mtpcr.match"
+    needs: ClassVar[tuple[str, ...]] = ("mtpcr_geo.match.correlation", "mtpcr_geo.pipeline.stages.hypotheses")
     Options: ClassVar[OptionsModel] = MatchOptions
     options: MatchOptions
 

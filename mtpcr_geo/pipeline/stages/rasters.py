@@ -73,6 +73,7 @@ class Level(Stage):
     """
 
     type: ClassVar[str] = "mtpcr.level"
+    needs: ClassVar[tuple[str, ...]] = ("mtpcr_geo.method.levelling", "mtpcr_geo.crs")
     Options: ClassVar[OptionsModel] = LevelOptions
     options: LevelOptions
 
