@@ -23,6 +23,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import MissingPartError, OptionError, RegistrationError
 from mtpcr_geo.core.progress import Progress
+from mtpcr_geo.core.system import cores
 from mtpcr_geo.core.types import Floats, Pair, Verdict
 from mtpcr_geo.core.uncertainty import Uncertainty
 from mtpcr_geo.core.wording import visible
@@ -317,15 +318,18 @@ def register(
         writers = writers_for(source, Path(out), chosen)
         nodes += chained(writers, (nodes[-1].tag,))
         earlier = further_files(Path(out))
-        result = run(nodes, overwrite=chosen.overwrite, progress=progress, replaces=earlier)
+        with cores(chosen.threads):
+            result = run(nodes, overwrite=chosen.overwrite, progress=progress, replaces=earlier)
         return Registration(result, chosen)
     if not chosen.recording:
-        return Registration(run(nodes, progress=progress), chosen)
+        with cores(chosen.threads):
+            return Registration(run(nodes, progress=progress), chosen)
     # kept in a temporary folder until it is saved; deleted together with the registration
     folder = Path(tempfile.mkdtemp(prefix="mtpcr-geo-"))
     nodes += chained([recording_writer(folder)], (nodes[-1].tag,))
     try:
-        result = run(nodes, progress=progress)
+        with cores(chosen.threads):
+            result = run(nodes, progress=progress)
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise

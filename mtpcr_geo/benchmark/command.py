@@ -51,6 +51,14 @@ def benchmark(
             "on the sites that it was not fitted to."
         ),
     ] = None,
+    scale: Annotated[
+        str,
+        typer.Option(
+            help="Register one pair of --data densified to so many million points a cloud instead, such as "
+            "'1 3 10', beside laspy and PDAL; draws time and memory."
+        ),
+    ] = "",
+    threads: Annotated[int, typer.Option(min=0, help="With --scale: processor cores; 0 takes all.")] = 0,
     starts: Annotated[int, typer.Option(min=1, help="Random starts of each pair.")] = 10,
     jobs: Annotated[int, typer.Option(min=1, help="Runs at a time.")] = 1,
     yaw: Annotated[float, typer.Option(help="Starts are turned by 0 to this, degrees.")] = 360.0,
@@ -78,6 +86,9 @@ def benchmark(
         report = fit_probability(calibrate, out)
         if not quiet:
             typer.echo(report)
+        return
+    if scale:
+        _scale(scale, data or [], tuple(only or ()), out, threads, quiet)
         return
     if robustness:
         from mtpcr_geo.benchmark.robustness.suites import SuiteOptions
@@ -122,6 +133,26 @@ def benchmark(
         )
     if not quiet:
         typer.echo(shown(rows) + f"\nTables and plots: {out}")
+
+
+def _scale(sizes: str, data: list[Path], only: tuple[str, ...], out: Path, threads: int, quiet: bool) -> None:
+    from mtpcr_geo.benchmark.pairs import pair_folders
+    from mtpcr_geo.benchmark.runs import numbers_of
+    from mtpcr_geo.benchmark.scale import run_scale
+
+    found = [folder for one in data for folder in pair_folders(one, only)]
+    if len(found) != 1:
+        names = ", ".join(folder.name for folder in found) or "none"
+        raise OptionError(f"--scale takes one pair: name it by --data and --only; there are {names}")
+    with progress_bars(quiet) as progress:
+        rows = run_scale(found[0], numbers_of(sizes), out, threads=threads, progress=progress)
+    if not quiet:
+        for row in rows:
+            typer.echo(
+                f"{row['million_points']:7g} million  {row['wall_s']:8.2f} s  {row['cpu_s']:8.2f} s of "
+                f"processors  {row['peak_mib'] or 0:6.0f} MiB  {row['job']}"
+            )
+        typer.echo(f"Tables and plot: {out}")
 
 
 def _robustness(

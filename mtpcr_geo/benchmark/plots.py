@@ -65,7 +65,7 @@ def draw_all(rows: Sequence[Row], files: Mapping[str, Path], note: str = "") -> 
         MissingPartError: if matplotlib is not installed.
 
     """
-    plt = _pyplot()
+    plt = pyplot()
     for name, path in files.items():
         wide = 10.0 if name == "cumulative_errors" else 6.4
         figure = plt.figure(figsize=(wide, 4.2), layout="constrained")
@@ -156,7 +156,13 @@ def _legend(axis: Any) -> None:
         axis.legend(fontsize=8, frameon=False)
 
 
-def _pyplot() -> Any:
+def pyplot() -> Any:
+    """Return matplotlib's pyplot, for files only.
+
+    Raises:
+        MissingPartError: if it is not installed.
+
+    """
     try:
         import matplotlib
     except ImportError as error:
@@ -188,7 +194,7 @@ def draw_radii(rows: Sequence[Row], path: Path) -> None:
         MissingPartError: if matplotlib is not installed.
 
     """
-    plt = _pyplot()
+    plt = pyplot()
     figure = plt.figure(figsize=(6.4, 4.2), layout="constrained")
     axis = figure.subplots()
     radii = sorted({row["radius"] for row in rows})
@@ -219,7 +225,7 @@ def draw_reliability(lines: Sequence[Mapping[str, Any]], path: Path) -> None:
         MissingPartError: if matplotlib is not installed.
 
     """
-    plt = _pyplot()
+    plt = pyplot()
     figure = plt.figure(figsize=(4.8, 4.6), layout="constrained")
     axis = figure.subplots()
     axis.plot([0, 100], [0, 100], color="0.6", linewidth=1)

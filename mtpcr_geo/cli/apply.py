@@ -15,10 +15,11 @@ def run(options: ApplyVerb) -> None:
         mtpcr-geo apply out/transform.json moved.laz back.laz --inverse
 
     """
+    from mtpcr_geo.core.system import cores
     from mtpcr_geo.export.apply import apply_transform
     from mtpcr_geo.export.transform import doubts_of
 
-    with progress_bars(options.quiet) as progress:
+    with cores(options.threads), progress_bars(options.quiet) as progress:
         written = apply_transform(
             options.transform,
             options.cloud,

@@ -25,6 +25,7 @@ from mtpcr_geo.pipeline.options import (
     TargetAxes,
     TargetCrs,
     TargetUnit,
+    Threads,
     Vertical,
     Within,
 )
@@ -143,6 +144,7 @@ class ApplyVerb(VerbOptions):
     inverse: Annotated[
         bool, Field(description="move from the target's frame to the source's instead"), Shown(RUN)
     ] = False
+    threads: Threads = 0
     overwrite: Overwrite = False
     quiet: Quiet = False
 

@@ -166,11 +166,15 @@ def _metric_rows(metrics: Mapping[str, Any], verbose: bool) -> list[tuple[str, s
 
 
 def _print_stages(done: Sequence[StageRecord]) -> None:
-    """Print the seconds of each stage, on standard error."""
+    """Print what each stage took, on standard error: seconds, processor seconds, largest memory so far."""
     from rich.console import Console
 
     talk = Console(stderr=True, highlight=False)
     for record in done:
         note = record.skipped or record.failed or ""
-        text = f"  {record.seconds:8.2f} s  {record.tag} ({record.type}) {note}".rstrip()
+        cpu, memory = record.used.get("cpu_s"), record.used.get("peak_memory_mb")
+        more = ("" if cpu is None else f"  {cpu:8.2f} s of processors") + (
+            "" if memory is None else f"  {memory:7.0f} MiB"
+        )
+        text = f"  {record.seconds:8.2f} s{more}  {record.tag} ({record.type}) {note}".rstrip()
         talk.print(visible(text), soft_wrap=True, markup=False)

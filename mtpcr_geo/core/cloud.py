@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -52,6 +53,14 @@ class Cloud(ABC):
         """Return all (n, 3) float64 coordinates in the cloud's own CRS and units."""
         chunks = list(self.xyz_chunks())
         return np.concatenate(chunks) if chunks else np.empty((0, 3))
+
+    def keep(self, until: ExitStack) -> None:  # noqa: B027 - what is not compressed need not be kept
+        """Let the first pass over all coordinates keep them in a temporary file, where that saves time.
+
+        Args:
+            until: the file is gone when this is closed.
+
+        """
 
     def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, Mask]]:
         """Yield coordinates (n, 3) and which of them are noise or withheld (n,), n <= size.

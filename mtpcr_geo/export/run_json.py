@@ -46,6 +46,12 @@ for a name: a stage's tag, a role (source, target, result, work), a library.
 - ``stages[].tag``: its name in the pipeline
 - ``stages[].options``: its options, as above
 - ``stages[].seconds``: its time
+- ``stages[].cpu_s``: processor time of all threads meanwhile, the recording's too
+- ``stages[].read_mb``: read from files meanwhile, MiB; this and what follows are null where the system does
+  not report it
+- ``stages[].written_mb``: likewise written
+- ``stages[].memory_mb``: memory that the process held at its end, MiB
+- ``stages[].peak_memory_mb``: largest memory of the process so far
 - ``stages[].metadata``: its own figures, see below
 - ``stages[].skipped``: why it did not run or made nothing, where it did not
 - ``stages[].failed``: why the registration ended there, where it did

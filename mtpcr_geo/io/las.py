@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,12 +15,14 @@ import lazrs
 import numpy as np
 from laspy import DecompressionSelection as Fields
 
+from mtpcr_geo.core.ahead import ahead
 from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.core.paths import real
-from mtpcr_geo.core.system import sha256
+from mtpcr_geo.core.system import sha256, usable_cores
 from mtpcr_geo.io.dimensions import las_table, noise_of_record
+from mtpcr_geo.io.kept import KeptPoints, placed
 from mtpcr_geo.io.las_header import Head, Overlaid
 from mtpcr_geo.io.vlr import crs_of_records
 
@@ -78,6 +80,7 @@ class LasCloud(Cloud):
             self.crs, self.crs_problem = crs_of_records(head.records)
         self.count = head.count
         self._head = head.raw
+        self._kept: KeptPoints | None = None
         self.minimum = np.array(header.mins, np.float64)
         self.maximum = np.array(header.maxs, np.float64)
 
@@ -94,6 +97,9 @@ class LasCloud(Cloud):
             InputError: if the file is truncated or damaged.
 
         """
+        yield from ahead(self._record_chunks(size, fields))
+
+    def _record_chunks(self, size: int, fields: Fields | None) -> Iterator[laspy.ScaleAwarePointRecord]:
         with self._points(fields) as reader:
             left = self.count
             while left:
@@ -128,7 +134,9 @@ class LasCloud(Cloud):
         stream = BufferedReader(Overlaid(self.path, self._head), 1 << 20)
         with (
             _reported(self.path),
-            laspy.open(stream, read_evlrs=False, decompression_selection=chosen) as reader,
+            laspy.open(
+                stream, laz_backend=_backend(), read_evlrs=False, decompression_selection=chosen
+            ) as reader,
         ):
             reader.header.point_count = self.count
             yield reader
@@ -151,9 +159,38 @@ class LasCloud(Cloud):
             yield xyz_of(record)
 
     def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, Mask]]:
-        """Yield coordinates (n, 3) and which of them are noise or withheld (n,)."""
+        """Yield coordinates (n, 3) and which of them are noise or withheld (n,), see `keep`."""
+        if self._kept is not None and self._kept.holds(size):
+            yield from ahead(self._kept.chunks())
+            return
+        keeper = self._kept.keeper(size) if self._kept is not None else None
         for record in self.record_chunks(size, _XYZ_AND_CLASS):
-            yield xyz_of(record), noise_of_record(record)
+            noise = noise_of_record(record)
+            if keeper is not None:
+                keeper.add(record.array, noise)
+            yield xyz_of(record), noise
+        if keeper is not None:
+            keeper.finish()
+
+    def keep(self, until: ExitStack) -> None:
+        """Let the first pass over all coordinates keep them in a temporary file, for the passes after it.
+
+        Decoding takes ten times as long as reading them there. They take 13 bytes a point, and nothing is
+        kept where the folder of temporary files has no room for twice that.
+
+        Args:
+            until: the file is gone when this is closed; then the cloud is decoded again.
+
+        """
+        if self._kept is None:
+            self._kept = KeptPoints.for_cloud(self.count, self.header.scales, self.header.offsets)
+            if self._kept is not None:
+                until.callback(self._forget)
+
+    def _forget(self) -> None:
+        if self._kept is not None:
+            self._kept.close()
+            self._kept = None
 
     def table_chunks(self, size: int = CHUNK_POINTS) -> Iterator[PointTable]:
         """Yield tables of all dimensions by PDAL name (X, Y, Z in float64 first), n <= size rows each."""
@@ -163,13 +200,11 @@ class LasCloud(Cloud):
 
 def xyz_of(record: Any) -> Floats:
     """Return the (n, 3) float64 coordinates of a laspy point record."""
-    xyz = np.empty((len(record), 3))
-    # scales and offsets of a broken header give what is not finite, which whoever takes the points refuses
-    with np.errstate(all="ignore"):
-        for axis, name in enumerate("XYZ"):
-            np.multiply(record.array[name], record.scales[axis], out=xyz[:, axis])
-            xyz[:, axis] += record.offsets[axis]
-    return xyz
+    return placed(record.array, record.scales, record.offsets)
+
+
+def _backend() -> laspy.LazBackend:
+    return laspy.LazBackend.Lazrs if usable_cores() == 1 else laspy.LazBackend.LazrsParallel
 
 
 def open_cloud(path: str | Path, crs: CRS | None = None) -> LasCloud:

@@ -121,10 +121,10 @@ def modern(record: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
     Class 12 of the old formats means overlap: the class stays and the flag of that name is set.
     """
     old = record.array
-    new = np.zeros(len(old), dtype)
     if old.dtype == dtype:
-        new[:] = old
-        return new
+        # read for this and nothing else: it need not be copied
+        return np.asarray(old if old.flags.writeable else old.copy())
+    new = np.zeros(len(old), dtype)
     for name in (*_COPIED, *_WAVEFORM, *record.point_format.extra_dimension_names):
         if name in old.dtype.names and name in (dtype.names or ()):
             new[name] = old[name]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import json
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -52,6 +53,11 @@ class ManyFiles(FileCloud):
         """Yield coordinates (n, 3) and which of them are noise or withheld (n,), likewise."""
         rows = _refilled((row for part in self.parts for row in part.noise_chunks(size)), size)
         yield from ((xyz, noise) for xyz, noise in rows)
+
+    def keep(self, until: ExitStack) -> None:
+        """Let the first pass over all coordinates keep those of each file in a temporary one."""
+        for part in self.parts:
+            part.keep(until)
 
     def table_chunks(self, size: int = CHUNK_POINTS) -> Iterator[PointTable]:
         """Yield tables of the dimensions that all files have, n <= size rows each."""

@@ -12,6 +12,7 @@ import numpy as np
 from mtpcr_geo.core.arrays import ComparesArrays, Floats
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud
 from mtpcr_geo.core.errors import InputError
+from mtpcr_geo.core.transforms import bounds
 from mtpcr_geo.io.no_returns import NoReturns, without
 from mtpcr_geo.io.strays import beyond, stray_box, within
 
@@ -90,10 +91,9 @@ def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progres
         for xyz, noise in cloud.noise_chunks():
             _check_finite(cloud, xyz, count)
             count += len(xyz)
-            if len(xyz):
-                whole = np.stack(
-                    [np.minimum(whole[0], xyz.min(axis=0)), np.maximum(whole[1], xyz.max(axis=0))]
-                )
+            box_of_all = bounds(xyz) if len(xyz) else None
+            if box_of_all is not None:
+                whole = np.stack([np.minimum(whole[0], box_of_all[0]), np.maximum(whole[1], box_of_all[1])])
             good = xyz[~noise] if noise.any() else xyz
             dropped += len(xyz) - len(good)
             before = count - len(xyz) > 0
@@ -101,8 +101,10 @@ def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progres
             returned = without(good, none.places)
             no_returns += len(good) - len(returned)
             if len(returned):
-                np.minimum(minimum, returned.min(axis=0), out=minimum)
-                np.maximum(maximum, returned.max(axis=0), out=maximum)
+                # hardly ever is anything left out, and then the bounds are known already
+                low, high = box_of_all if returned is xyz and box_of_all else bounds(returned)
+                np.minimum(minimum, low, out=minimum)
+                np.maximum(maximum, high, out=maximum)
                 kept.add(returned)
             advance(len(xyz))
     sample = kept.result()
@@ -181,8 +183,9 @@ def _bounds_again(cloud: Cloud, places: Floats, box: Floats | None, good: int) -
     """Return the bounds without the points on some places or beyond a box, and the number of these."""
     minimum, maximum, returned = np.full(3, np.inf), np.full(3, -np.inf), 0
     for xyz in surface_chunks(cloud, places=places, box=box):
-        np.minimum(minimum, xyz.min(axis=0), out=minimum)
-        np.maximum(maximum, xyz.max(axis=0), out=maximum)
+        low, high = bounds(xyz)
+        np.minimum(minimum, low, out=minimum)
+        np.maximum(maximum, high, out=maximum)
         returned += len(xyz)
     return minimum, maximum, good - returned
 
@@ -246,17 +249,28 @@ class _Subset:
             self.points = np.concatenate([self.points, np.empty_like(self.points)])
             return
         keys = self.keys[: self.size]
-        # keys are 53 bit random numbers: equal ones are possible in theory, hence the cut by rank
-        chosen = np.sort(np.argpartition(keys, self.budget)[: self.budget])
-        self.bound = float(keys[chosen].max())
-        self.points[: self.budget] = self.points[chosen]
-        self.keys[: self.budget] = keys[chosen]
+        self.bound = float(np.partition(keys, self.budget - 1)[self.budget - 1])
+        chosen = keys <= self.bound
+        spare = int(np.count_nonzero(chosen)) - self.budget
+        if spare:
+            # keys are 53 bit random numbers: equal ones are possible in theory, and the first are kept
+            chosen[np.flatnonzero(keys == self.bound)[-spare:]] = False
+        place = 0
+        for start in range(0, self.size, CHUNK_POINTS):
+            # block by block, so that no second array of all points is needed
+            part = chosen[start : start + CHUNK_POINTS]
+            number = int(np.count_nonzero(part))
+            self.points[place : place + number] = self.points[start : start + CHUNK_POINTS][: len(part)][part]
+            self.keys[place : place + number] = keys[start : start + CHUNK_POINTS][part]
+            place += number
         self.size = self.budget
 
     def result(self) -> Floats:
         if self.rng is not None and self.size > self.budget:
             self._thin()
-        return self.points[: self.size].copy() if self.size < len(self.points) else self.points
+        # nobody else holds the array: it is cut short where it stands, without a copy beside it
+        self.points.resize((self.size, 3), refcheck=False)
+        return self.points
 
 
 def _check_finite(cloud: Cloud, xyz: Floats, before: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -86,6 +87,10 @@ class View(Cloud):
             if keep.any():
                 yield xyz[keep], noise[keep]
 
+    def keep(self, until: ExitStack) -> None:
+        """Let the first pass over all coordinates of the base keep them in a temporary file."""
+        self.base.keep(until)
+
     def _masked(self, chunks: Iterable[tuple[Any, Floats]]) -> Iterator[tuple[Any, NDArray[np.bool_]]]:
         raise NotImplementedError
 
@@ -159,6 +164,10 @@ class Moved(Cloud):
         for xyz in self.xyz_chunks():
             low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
         return low, high
+
+    def keep(self, until: ExitStack) -> None:
+        """Let the first pass over all coordinates of the base keep them in a temporary file."""
+        self.base.keep(until)
 
     def _moved(self, xyz: Floats) -> Floats:
         # points of a broken file may lie anywhere; whoever takes them refuses what is not finite

@@ -238,8 +238,11 @@ def _placed(
             if offsets is None:
                 offsets = np.rint((moved.min(axis=0) + moved.max(axis=0)) / 2)
             header.offsets = offsets
-            steps = np.rint((moved - offsets) / storage.scales)
-        worst = float(np.abs(steps).max())
+            steps = moved - offsets
+            steps /= storage.scales
+            np.rint(steps, out=steps)
+        # a NaN makes it one
+        worst = float(np.maximum(steps.max(), -steps.min()))
         kept = packed
         if not worst <= MOST_STEPS:
             if storage.offsets is None:

@@ -111,10 +111,13 @@ def _lowest(xyz: Floats, cell: float) -> Floats:
     xyz = xyz[inside]
     column, row = np.floor((xyz[:, :2] - low) / cell).astype(np.int64).T
     key = column * (int(row.max(initial=0)) + 1) + row
-    order = np.lexsort((xyz[:, 2], key))
+    z = np.ascontiguousarray(xyz[:, 2])
     # hardly any points may all be left out
-    first = np.concatenate([[True], np.diff(key[order]) > 0])[: len(order)]
-    return np.asarray(xyz[order[first]])
+    lowest = np.full(int(key.max(initial=-1)) + 1, np.inf)
+    np.minimum.at(lowest, key, z)
+    low_ones = np.flatnonzero(z == lowest[key])
+    _, first = np.unique(key[low_ones], return_index=True)
+    return np.asarray(xyz[low_ones[first]])
 
 
 def _plane(lowest: Floats, extent: float) -> tuple[Floats, float, Floats]:

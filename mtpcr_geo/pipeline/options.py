@@ -19,7 +19,17 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from mtpcr_geo.core.suggestions import meant
 from mtpcr_geo.core.units import UNITS, Axes, Unit
 from mtpcr_geo.pipeline.file_options import Also, Scale, SourceText, TargetText
-from mtpcr_geo.pipeline.shown import INPUTS, MATCHING, OUTPUT, PRIOR, RASTERS, RESULT, Shown, description_of
+from mtpcr_geo.pipeline.shown import (
+    INPUTS,
+    MATCHING,
+    OUTPUT,
+    PRIOR,
+    RASTERS,
+    RESULT,
+    RUN,
+    Shown,
+    description_of,
+)
 
 SourceCrs = Annotated[
     str | None,
@@ -299,6 +309,9 @@ Force = Annotated[
     Field(description="write the registered cloud and its transform though the verdict withholds them"),
     Shown(RESULT),
 ]
+Threads = Annotated[
+    int, Field(ge=0, description="processor cores to use; 0 takes all"), Shown(RUN, metavar="N")
+]
 Overwrite = Annotated[bool, Field(description="replace files that are there already"), Shown(OUTPUT)]
 
 
@@ -361,6 +374,7 @@ class RegisterOptions(MethodOptions):
     ] = True
     force: Force = False
     overwrite: Overwrite = False
+    threads: Threads = 0
 
 
 def first_problem(error: ValidationError, model: type[BaseModel], spelt: Callable[[str], str] = repr) -> str:

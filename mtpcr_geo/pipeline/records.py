@@ -25,6 +25,7 @@ class StageRecord:
         failed: why it could not go on, or None.
         not_written: files that it would have written, and why it did not.
         forced: whether it wrote, or let through, what the verdict withholds.
+        used: processor time, memory and bytes, see `mtpcr_geo.core.system.Meter.since`; for the audit.
 
     """
 
@@ -37,6 +38,7 @@ class StageRecord:
     failed: str | None = None
     not_written: Mapping[Path, str] = field(default_factory=dict)
     forced: bool = False
+    used: Mapping[str, float | None] = field(default_factory=dict)
 
     def audit(self) -> dict[str, Any]:
         """Return the record as a dict, for JSON and reports."""
@@ -47,6 +49,7 @@ class StageRecord:
             "options": dict(self.options),
             **{key: reason for key, reason in reasons.items() if reason is not None},
             "seconds": self.seconds,
+            **self.used,
             "metadata": dict(self.metadata),
         }
 

@@ -11,9 +11,10 @@ from pathlib import Path
 
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError, RegistrationError
+from mtpcr_geo.core.imports import import_ahead
 from mtpcr_geo.core.paths import real, short
 from mtpcr_geo.core.progress import NoProgress, Progress
-from mtpcr_geo.core.system import versions
+from mtpcr_geo.core.system import Meter, versions
 from mtpcr_geo.core.types import Pair, Verdict
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.pipeline.grammar import StageSpec
@@ -173,6 +174,7 @@ def run(
                     inputs=tuple(file.hashed() for file in context.facts.inputs),
                 )
             outputs.keep(file.path for file in context.facts.inputs)
+            import_ahead(name for stage in stages for name in stage.needs)
             for stage in stages:
                 stage.open(context)
             context.recorder.begin(context.facts.audit())
@@ -264,7 +266,7 @@ def _preview(nodes: Sequence[Node], context: RunContext) -> None:
 
 def _turn(stage: Stage, inputs: Sequence[Value | None], context: RunContext) -> Value | None:
     """Run one stage, or skip it, and put it on record."""
-    start = time.perf_counter()
+    start = Meter.read()
     failed = None
     value: Value | None = None
     if not stage.evidence and (context.failure is not None or None in inputs):
@@ -280,7 +282,8 @@ def _turn(stage: Stage, inputs: Sequence[Value | None], context: RunContext) -> 
             pair = next((given for given in inputs if isinstance(given, Pair)), None)
             value = pair and pair.with_(verdict=Verdict("refused", (failed,), {}))
     options = stage.options.model_dump(mode="json")
-    seconds = time.perf_counter() - start
+    end = Meter.read()
+    seconds = end.seconds - start.seconds
     record = StageRecord(
         stage.type,
         stage.tag,
@@ -291,6 +294,7 @@ def _turn(stage: Stage, inputs: Sequence[Value | None], context: RunContext) -> 
         failed,
         dict(stage.not_written),
         stage.forced,
+        end.since(start),
     )
     context.done.append(record)
     context.recorder.after(stage.type, stage.tag, options, value, seconds)

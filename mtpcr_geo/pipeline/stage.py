@@ -108,6 +108,7 @@ class Stage(ABC):
         evidence: whether it still runs, with what there is, when the registration failed or was refused;
             its inputs may then hold None.
         late: whether it runs after all others, since it reports on the whole run.
+        needs: modules that it imports when it runs; they are imported while earlier stages work.
 
     """
 
@@ -115,6 +116,7 @@ class Stage(ABC):
     Options: ClassVar[OptionsModel]
     evidence: ClassVar[bool] = False
     late: ClassVar[bool] = False
+    needs: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, options: StageOptions, tag: str) -> None:
         self.options = options

@@ -82,8 +82,7 @@ def test_every_option_of_old_is_there(verb):
 def test_help_of_register_is_in_groups_and_ends_with_examples():
     text = help_text("register")
     groups = re.findall(r"^(\S.*):$", text, flags=re.MULTILINE)
-    wanted = [group for group in GROUPS if group != "Run"]
-    assert groups == ["Arguments", *wanted, "Options", "Examples"]
+    assert groups == ["Arguments", *GROUPS, "Options", "Examples"]
     assert text.rstrip().splitlines()[-1].strip().startswith("mtpcr-geo register ")
 
 
@@ -155,7 +154,7 @@ def test_every_option_reaches_register(monkeypatch):
         "motion": "yaw", "profile": "paper", "matcher": "orb", "models": "folder",
         "source_text": "x y z separator=; skip=2", "target_text": "x - y z", "scale": 0.01, "also": "ply",
         "res": False, "focus": False, "enhance": False, "seed": 4, "recording": False, "force": True,
-        "overwrite": True,
+        "overwrite": True, "threads": 3,
     }  # fmt: skip
     # with a whole pose there is neither place nor yaw
     posed = {"prior": "georef", "prior_sigma": 7.5, "prior_yaw": 8.0}

@@ -107,6 +107,7 @@ class WriteBev(EvidenceWriter):
     """Write the height rasters as GeoTIFF."""
 
     type: ClassVar[str] = "mtpcr.write_bev"
+    needs: ClassVar[tuple[str, ...]] = ("rasterio", "mtpcr_geo.export.geotiff")
 
     Options: ClassVar[OptionsModel] = BevFileOptions
     options: BevFileOptions
@@ -156,6 +157,7 @@ class WriteTiePoints(EvidenceWriter):
     """Write tie points, their links, footprints and hypotheses as a GeoPackage."""
 
     type = "mtpcr.write_tie_points"
+    needs: ClassVar[tuple[str, ...]] = ("mtpcr_geo.export.tie_points",)
 
     def missing(self, pair: Pair, context: RunContext) -> str | None:
         """Need tie points."""
@@ -247,6 +249,7 @@ class WriteReport(EvidenceWriter):
     """Write the report about the whole run, as HTML that needs no other file."""
 
     type = "mtpcr.write_report"
+    needs: ClassVar[tuple[str, ...]] = ("mtpcr_geo.export.report.page",)
     late = True
 
     def write(self, pair: Pair, context: RunContext) -> None:

@@ -11,8 +11,9 @@ import numpy as np
 from pydantic import Field
 
 from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.system import core_limit
 from mtpcr_geo.core.types import Appearance, Bev, Look, Pair, Side
-from mtpcr_geo.pipeline.options import MatcherName, Models, PriorOptions, Seed
+from mtpcr_geo.pipeline.options import MatcherName, Models, PriorOptions, Seed, Threads
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 from mtpcr_geo.pipeline.stages.pairs import bevs_of
 from mtpcr_geo.pipeline.stages.priors import audit_of, known_place, prior_of
@@ -130,9 +131,7 @@ class MatchOptions(PriorOptions, StageOptions):
     device: Literal["auto", "cpu", "cuda"] = Field(
         "auto", description="where learned matchers run; auto takes CUDA where onnxruntime offers it"
     )
-    threads: int = Field(
-        0, ge=0, description="threads of learned matchers on the processor; 0 takes all cores"
-    )
+    threads: Threads = 0
     seed: Seed = 0
 
 
@@ -140,6 +139,7 @@ class Match(Stage):
     """Find point pairs in the two rasters, at any yaw."""
 
     type: ClassVar[str] = "mtpcr.match"
+    needs: ClassVar[tuple[str, ...]] = ("mtpcr_geo.match.correlation", "mtpcr_geo.pipeline.stages.hypotheses")
     Options: ClassVar[OptionsModel] = MatchOptions
     options: MatchOptions
 
@@ -239,7 +239,7 @@ class Match(Stage):
             ratio=o.ratio,
             cross_check=o.cross_check,
             device=o.device,
-            threads=o.threads,
+            threads=o.threads or core_limit(),
         )
         return make_matcher(o.method, correlation, keypoints)
 

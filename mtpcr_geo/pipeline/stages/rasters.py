@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.ahead import ahead
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import CrsError, InputError, OptionError
@@ -72,6 +73,7 @@ class Level(Stage):
     """
 
     type: ClassVar[str] = "mtpcr.level"
+    needs: ClassVar[tuple[str, ...]] = ("mtpcr_geo.method.levelling", "mtpcr_geo.crs")
     Options: ClassVar[OptionsModel] = LevelOptions
     options: LevelOptions
 
@@ -128,6 +130,10 @@ class Level(Stage):
         if len(clouds) == 2:
             check_distinct(target, source)
         options = self.options
+        for cloud in clouds:
+            if cloud.count > options.budget:
+                # the rasters take all points: a second pass
+                cloud.keep(context.at_end)
         found = [
             scan(cloud, budget=options.budget, seed=options.seed, progress=context.progress)
             for cloud in clouds
@@ -280,9 +286,16 @@ def rasterised(side: Side, cell: float, convention: Convention, context: RunCont
 def _levelled_chunks(side: Side, context: RunContext) -> Iterator[Floats]:
     from mtpcr_geo.io.sample import surface_chunks
 
-    with context.progress.task(f"rasterising {side.cloud.name}", side.cloud.count) as advance:
+    upright = np.array_equal(side.T_level_work, np.eye(4))
+
+    def levelled() -> Iterator[Floats]:
         for xyz in surface_chunks(side.cloud, places=side.no_return_places, box=side.box):
-            yield transforms.apply(side.T_level_work, in_work_frame(side.link, xyz))
+            work = in_work_frame(side.link, xyz)
+            yield work if upright else transforms.apply(side.T_level_work, work)
+
+    with context.progress.task(f"rasterising {side.cloud.name}", side.cloud.count) as advance:
+        for xyz in ahead(levelled()):
+            yield xyz
             advance(len(xyz))
 
 

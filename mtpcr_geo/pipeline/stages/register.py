@@ -9,6 +9,9 @@ from typing import ClassVar
 
 from mtpcr_geo.pipeline.options import MethodOptions
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
+from mtpcr_geo.pipeline.stages.matching import Match
+from mtpcr_geo.pipeline.stages.rasters import Level
+from mtpcr_geo.pipeline.stages.solving import Assess, Refine
 from mtpcr_geo.pipeline.stages.steps import steps_of
 
 
@@ -23,6 +26,7 @@ class Register(Stage):
     """
 
     type = "mtpcr.register"
+    needs = (*Level.needs, *Match.needs, *Refine.needs, *Assess.needs)
     Options: ClassVar[OptionsModel] = RegisterStageOptions
     options: RegisterStageOptions
 

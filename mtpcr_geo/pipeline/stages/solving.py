@@ -169,6 +169,11 @@ class Refine(Stage):
     """Refine by ICP on the overlap, with the height settled on the ground."""
 
     type: ClassVar[str] = "mtpcr.refine"
+    needs: ClassVar[tuple[str, ...]] = (
+        "small_gicp",
+        "mtpcr_geo.method.refine",
+        "mtpcr_geo.pipeline.stages.feedback",
+    )
     Options: ClassVar[OptionsModel] = RefineOptions
     options: RefineOptions
 
@@ -291,6 +296,7 @@ class Assess(Stage):
     """Judge the result by what the fit did not see: accepted, doubtful or refused, with reasons."""
 
     type: ClassVar[str] = "mtpcr.assess"
+    needs: ClassVar[tuple[str, ...]] = ("mtpcr_geo.verdict.evidence",)
     Options: ClassVar[OptionsModel] = AssessOptions
     options: AssessOptions
 

@@ -1,0 +1,136 @@
+"""Single jobs of other libraries and of this package, each run in a process of its own to be measured.
+
+``python -m mtpcr_geo.benchmark.yardsticks JOB PATHS...`` with a job of `JOBS`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mtpcr_geo.core.errors import MissingPartError, MtpcrError
+
+CHUNK_POINTS = 1_000_000
+CELL_M = 1.0
+MOVE = "0.8 -0.6 0 20 0.6 0.8 0 -10 0 0 1 3 0 0 0 1"
+"""A turn of 37 degrees and a shift, as filters.transformation of PDAL has it."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a process took.
+
+    Attributes:
+        wall_s: from its start to its end.
+        cpu_s: processor time of all its threads.
+        peak_mib: largest memory; None where the system does not report it.
+
+    """
+
+    wall_s: float
+    cpu_s: float
+    peak_mib: float | None
+
+
+def measured(command: Sequence[str | Path]) -> Measured:
+    """Run a command to its end, and return what it took.
+
+    Raises:
+        MissingPartError: if the system cannot tell what a process took.
+        MtpcrError: if the command fails; the message ends with what it printed.
+
+    """
+    if not hasattr(os, "wait4"):
+        raise MissingPartError("this system does not tell what a process took; run this on Linux or macOS")
+    start = time.perf_counter()
+    with subprocess.Popen(
+        [str(word) for word in command], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stderr is not None
+        printed = process.stderr.read()
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+    wall = time.perf_counter() - start
+    if process.returncode not in (0, 3, 4):  # a verdict is no failure of the run
+        last = (printed.decode(errors="replace").strip().splitlines() or [""])[-1]
+        raise MtpcrError(f"{' '.join(str(word) for word in command[:6])} ... failed: {last}")
+    # bytes on macOS, kibibytes elsewhere
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return Measured(wall, used.ru_utime + used.ru_stime, used.ru_maxrss / unit)
+
+
+def job(name: str, *paths: str | Path) -> list[str]:
+    """Return the command that does a job of `JOBS`."""
+    return [sys.executable, "-m", __name__, name, *map(str, paths)]
+
+
+def laspy_read(*paths: str) -> None:
+    """Read files by laspy, decoded in parallel, a million points at a time."""
+    import laspy
+
+    for path in paths:
+        with laspy.open(path) as reader:
+            for _ in reader.chunk_iterator(CHUNK_POINTS):
+                pass
+
+
+def laspy_copy(path: str, out: str) -> None:
+    """Read a file and write it again by laspy, in parallel, a million points at a time."""
+    import laspy
+
+    with laspy.open(path) as reader, laspy.open(out, "w", header=reader.header, do_compress=True) as writer:
+        for points in reader.chunk_iterator(CHUNK_POINTS):
+            writer.write_points(points)
+
+
+def own_bev(path: str, out: str) -> None:
+    """Rasterise a file into the highest and lowest height and the count of each cell, by this package."""
+    from mtpcr_geo.pipeline.api import Pipeline
+
+    level = {"type": "mtpcr.level", "method": "none", "local": True}
+    stages = [path, level, {"type": "mtpcr.bev", "cell": CELL_M}]
+    Pipeline([*stages, {"type": "mtpcr.write_bev", "filename": out}], overwrite=True).execute()
+
+
+def pdal_bev(path: str, out: str) -> None:
+    """Do the same by PDAL's writers.gdal, in its streaming mode."""
+    writer = {
+        "type": "writers.gdal",
+        "filename": out,
+        "resolution": CELL_M,
+        "output_type": "max,min,count",
+        "binmode": True,
+        "gdalopts": "COMPRESS=DEFLATE,TILED=YES",
+    }
+    _stream([path, writer])
+
+
+def pdal_move(path: str, out: str) -> None:
+    """Move a file by PDAL's filters.transformation, in its streaming mode."""
+    writer = {"type": "writers.las", "filename": out, "minor_version": 4, "forward": "all"}
+    _stream([path, {"type": "filters.transformation", "matrix": MOVE}, {**writer, "compression": "laszip"}])
+
+
+def _stream(stages: list[object]) -> None:
+    import pdal
+
+    pdal.Pipeline(json.dumps(stages)).execute_streaming(chunk_size=CHUNK_POINTS)
+
+
+JOBS: dict[str, Callable[..., None]] = {
+    "laspy-read": laspy_read,
+    "laspy-copy": laspy_copy,
+    "bev": own_bev,
+    "pdal-bev": pdal_bev,
+    "pdal-move": pdal_move,
+}
+
+
+if __name__ == "__main__":
+    JOBS[sys.argv[1]](*sys.argv[2:])

@@ -1,0 +1,30 @@
+"""Importing modules that will be needed while other work is done."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+
+from mtpcr_geo.core.system import usable_cores
+
+
+def import_ahead(names: Iterable[str]) -> None:
+    """Import modules in their order by another thread, and return at once.
+
+    Whoever imports one of them meanwhile waits until it is there. One that cannot be imported is left to
+    that place, where the reason is told. With one core to use nothing is done.
+
+    Args:
+        names: of the modules, those that are needed first first.
+
+    """
+    missing = [name for name in dict.fromkeys(names) if name not in sys.modules]
+    if not missing or usable_cores() == 1:
+        return
+    worker = ThreadPoolExecutor(1, thread_name_prefix="imports")
+    for name in missing:
+        # the result is not asked for, and an exception is part of it
+        worker.submit(importlib.import_module, name)
+    worker.shutdown(wait=False)
