@@ -52,6 +52,11 @@ VERBS = {
         "mtpcr_geo.cli.check:command",
         "Report what one or two clouds are and what is wrong with them, before they are registered.",
     ),
+    "survey": Verb(
+        "mtpcr_geo.cli.survey:command",
+        "Make a mosaic of height rasters of many TILES, once, to register scans against.",
+        more=True,
+    ),
     "apply": Verb(
         "mtpcr_geo.cli.apply:command", "Move a cloud by the transform of a registration, streamed."
     ),
