@@ -57,6 +57,10 @@ VERBS = {
         "Make a mosaic of height rasters of many TILES, once, to register scans against.",
         more=True,
     ),
+    "batch": Verb(
+        "mtpcr_geo.cli.batch:command",
+        "Register many sources, each to its target or to a survey; write a table and a map of all.",
+    ),
     "apply": Verb(
         "mtpcr_geo.cli.apply:command", "Move a cloud by the transform of a registration, streamed."
     ),

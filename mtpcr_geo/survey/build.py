@@ -24,13 +24,13 @@ from mtpcr_geo.crs.resolve import parse_crs
 from mtpcr_geo.io.formats import files_at, open_any
 from mtpcr_geo.io.no_returns import NoReturns, without
 from mtpcr_geo.method.bev import MAX_CELLS, choose_cell
+from mtpcr_geo.survey import is_survey
 from mtpcr_geo.survey.engine import engine_of
 from mtpcr_geo.survey.index import (
     INDEX,
     Survey,
     Tile,
     date_of,
-    is_survey,
     read_frame,
     write_atomic,
     write_frame,

@@ -15,12 +15,13 @@ import numpy as np
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import InputError, OutputError
 from mtpcr_geo.core.paths import read_whole, real
+from mtpcr_geo.survey import SURVEY
 from mtpcr_geo.survey.mosaic import FACTORS, Frame, Mosaic, Place
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.cloud import Cloud
 
-SURVEY, INDEX = "survey.json", "index.vpc"
+INDEX = "index.vpc"
 _FORMAT, _VERSION = "mtpcr-geo survey", 1
 _OWN = "mtpcr:"
 
@@ -172,11 +173,6 @@ class Survey:
     def with_tiles(self, tiles: Iterable[Tile]) -> Survey:
         """Return the survey with other tiles."""
         return replace(self, tiles=tuple(sorted(tiles, key=lambda tile: (tile.path.name, tile.id))))
-
-
-def is_survey(path: str | os.PathLike[str]) -> bool:
-    """Return whether a path is the folder of a survey."""
-    return (Path(path) / SURVEY).is_file()
 
 
 def read_frame(folder: Path) -> Frame:
