@@ -217,7 +217,7 @@ def scan(region: Region, middle: Floats, seed: int, radius: float = 100.0, point
     xyz = xyz[np.hypot(*(xyz[:, :2] - middle).T) < radius]
     if len(xyz) > points:
         xyz = xyz[np.sort(rng.choice(len(xyz), points, replace=False))]
-    return xyz + rng.normal(0.0, 0.02, xyz.shape) + [*CORNER, 0.0]
+    return np.asarray(xyz + rng.normal(0.0, 0.02, xyz.shape) + [*CORNER, 0.0])
 
 
 def _seen(

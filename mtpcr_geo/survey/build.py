@@ -16,7 +16,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from mtpcr_geo.core.errors import CrsError, InputError, OptionError, OutputError
+from mtpcr_geo.core.cloud import Cloud
+from mtpcr_geo.core.errors import CrsError, InputError, MtpcrError, OptionError, OutputError
 from mtpcr_geo.core.progress import NoProgress, Progress
 from mtpcr_geo.core.types import Bev
 from mtpcr_geo.crs.facts import facts_of, same_place
@@ -42,6 +43,7 @@ from mtpcr_geo.survey.vrt import write_virtual
 MOST_BLOCKS = MAX_CELLS // BLOCK_CELLS**2
 DEFAULTS = BuildOptions()
 _PARTS = "tiles"
+SOME_TILES = 20
 
 
 @dataclass(frozen=True)
@@ -166,8 +168,7 @@ def _frame(folder: Path, tiles: Sequence[Tile], options: BuildOptions) -> Frame:
         return frame
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder} is there already, and is no survey; name another folder")
-    # some tiles tell the density: all of a country would take an hour
-    heads = [open_any(tile.path) for tile in tiles[:: max(1, len(tiles) // 20)]]
+    heads = _heads(tiles)
     crs = heads[0].crs if options.crs is None else parse_crs(options.crs)
     if crs is None:
         problem = getattr(heads[0], "crs_problem", "") or "it states none"
@@ -190,6 +191,25 @@ def _frame(folder: Path, tiles: Sequence[Tile], options: BuildOptions) -> Frame:
     frame = Frame(wkt, float(cell), facts.unit, facts.height_unit)
     write_frame(folder, frame)
     return frame
+
+
+def _heads(tiles: Sequence[Tile]) -> list[Cloud]:
+    """Open some tiles, which tell CRS and density: all of a country would take an hour.
+
+    Raises:
+        InputError: if none can be opened.
+
+    """
+    heads: list[Cloud] = []
+    problem: MtpcrError | None = None
+    for tile in tiles[:: max(1, len(tiles) // SOME_TILES)]:
+        try:
+            heads.append(open_any(tile.path))
+        except InputError as error:
+            problem = error
+    if not heads:
+        raise InputError(f"no tile can be opened: {problem}")
+    return heads
 
 
 def _check_crs(claimed: str, frame: Frame, what: str) -> None:

@@ -14,8 +14,8 @@ from mtpcr_geo.match.search import Layer
 from mtpcr_geo.method.images import channels
 from mtpcr_geo.survey.mosaic import FACTORS, Mosaic
 
-MARGIN_M = 64.0
-"""Read beyond a window on each side: heights are band-passed, which needs the surroundings."""
+MARGIN_M = 24.0
+"""Read beyond a window on each side: heights are band-passed by blurs of 12 m."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Ground:
 
 def widened(bounds: Floats, by_m: float) -> Floats:
     """Return bounds, (2, 2), widened by so much on each side."""
-    return np.asarray(bounds, np.float64) + np.array([[-by_m], [by_m]])
+    return np.asarray(np.asarray(bounds, np.float64) + np.array([[-by_m], [by_m]]))
 
 
 def windows(bounds: Floats, edge_m: float) -> Iterator[Floats]:

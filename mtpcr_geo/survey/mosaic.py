@@ -79,12 +79,6 @@ class Frame:
         column, row = place
         return Grid(column * self.block_m, (row + 1) * self.block_m, self.cell_m, BLOCK_CELLS, BLOCK_CELLS)
 
-    def places_in(self, bounds: Floats) -> list[Place]:
-        """Return the blocks that bounds touch, (2, >= 2) in metres from the CRS's origin."""
-        low = np.floor(np.asarray(bounds)[0, :2] / self.block_m).astype(int)
-        high = np.floor(np.asarray(bounds)[1, :2] / self.block_m).astype(int)
-        return [(c, r) for r in range(low[1], high[1] + 1) for c in range(low[0], high[0] + 1)]
-
 
 class BlockRasteriser:
     """Collects points into blocks that are made as points fall into them; bounds need not be known.
@@ -107,7 +101,10 @@ class BlockRasteriser:
             InputError: if the points are spread over more blocks than memory holds.
 
         """
-        cell = np.floor(xyz[:, :2] / self.frame.cell_m).astype(np.int64)
+        column = np.floor(xyz[:, 0] / self.frame.cell_m)
+        # what lies on a line between two rows belongs to the southern one, as in every `Grid`
+        row = np.ceil(xyz[:, 1] / self.frame.cell_m) - 1.0
+        cell = np.column_stack([column, row]).astype(np.int64)
         block = np.floor_divide(cell, BLOCK_CELLS)
         low = block.min(axis=0)
         number = (block[:, 1] - low[1]) * (int(np.ptp(block[:, 0])) + 1) + block[:, 0] - low[0]
@@ -263,8 +260,10 @@ class Mosaic:
 
         """
         cell = self.frame.cell_m * factor
-        low = np.floor(np.asarray(bounds, np.float64)[0] / cell).astype(int)
-        high = np.maximum(np.ceil(np.asarray(bounds, np.float64)[1] / cell).astype(int), low + 1)
+        (west, south), (east, north) = np.asarray(bounds, np.float64) / cell
+        # points on a line between cells lie in the eastern and in the southern one
+        low = np.array([np.floor(west), np.ceil(south) - 1.0]).astype(int)
+        high = np.maximum(np.array([np.floor(east) + 1.0, np.ceil(north)]).astype(int), low + 1)
         width, height = (int(n) for n in high - low)
         top = np.full((height, width), np.nan, np.float32)
         lowest = top.copy()

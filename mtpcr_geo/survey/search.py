@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from mtpcr_geo.match.exploration import (
     HYPOTHESES,
     PROMISING_NEG_LOG10_P,
 )
-from mtpcr_geo.match.judge import Judge
+from mtpcr_geo.match.judge import CLEAR_MARGIN, Judge
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.pyramid import LARGEST_SEARCH, Pyramid
@@ -73,12 +73,18 @@ class Sought:
         bev: its height raster at the survey's finest cell, levelled.
         prior: what is known of its pose.
         ground: its bare ground in coarse cells.
+        layers: its channels by level, as far as they were made.
 
     """
 
     bev: Bev
     prior: Prior | None
     ground: Terrain
+    layers: dict[int, Layer] = field(default_factory=dict)
+
+    def over(self, target: Bev, shared: Pyramid | None = None) -> Pyramid:
+        """Return the levels of this source and a window of the survey; its own channels are made once."""
+        return _Window(self.bev, target, self.layers, shared)
 
     @property
     def grid(self) -> Grid:
@@ -93,6 +99,14 @@ class Sought:
     def pose_at(self, pose: Pose, of: Grid, to: Grid) -> Pose:
         """Express a pose about the centre of one grid of this source about that of another one."""
         return pose_of(pose.hypothesis(centre_of(of)), centre_of(to))
+
+
+class _Window(Pyramid):
+    """The levels of a source, which are kept from window to window, and of a window of the survey."""
+
+    def __init__(self, source: Bev, target: Bev, layers: dict[int, Layer], shared: Pyramid | None) -> None:
+        super().__init__(source, target, shared)
+        self._source = layers
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,6 +330,7 @@ class _Search:
             for pose in poses:
                 key = (int(pose.east // CHUNK_M), int(pose.north // CHUNK_M))
                 chunks.setdefault(key, [[], []])[number].append(pose)
+        made: list[dict[int, Layer]] = [{}, {}]
         found: list[list[Pose]] = [[], []]
         reach = max(one.reach_m for one in self.both) + MARGIN_M
         for key in sorted(chunks):
@@ -324,7 +339,7 @@ class _Search:
             target = self.ground.bev(widened(np.stack([held.min(axis=0), held.max(axis=0)]), reach), middle)
             shared: Pyramid | None = None
             for number, some in enumerate(poses):
-                pyramid = Pyramid(coarse[number], target, shared)
+                pyramid = _Window(coarse[number], target, made[number], shared)
                 shared = pyramid
                 fine = [
                     self.both[number].pose_at(p, above[number], pyramid.at(factor // middle)[0].grid)
@@ -351,8 +366,12 @@ class _Search:
                 known = max(known, self.pools[0].candidates[0].strength)
             left = self.pools[number].bound
             for start in range(0, len(poses), AT_ONCE):
-                for pose, judge in self._fine(one, middle, grid, poses[start : start + AT_ONCE]):
-                    some, bound = judge.judge([pose], known)
+                for pose, pyramid in self._fine(one, middle, grid, poses[start : start + AT_ONCE]):
+                    if pose.score * CLEAR_MARGIN < known:
+                        # as in `Judge.judge`: its strength is at most its score
+                        left = max(left, pose.score)
+                        continue
+                    some, bound = self._judge_with(one, pyramid).judge([pose], known)
                     left = max(left, bound)
                     judged += some
                     known = max([known, *(candidate.strength for candidate in some)])
@@ -363,23 +382,25 @@ class _Search:
         here = np.tile(np.array([pose.east, pose.north]), (2, 1))
         return self.ground.bev(widened(here, one.reach_m + MARGIN_M), 1)
 
-    def _fine(self, one: Sought, middle: int, grid: Grid, poses: Sequence[Pose]) -> list[tuple[Pose, Judge]]:
+    def _fine(
+        self, one: Sought, middle: int, grid: Grid, poses: Sequence[Pose]
+    ) -> list[tuple[Pose, Pyramid]]:
         """Follow poses to the finest cells, each in a window of its own."""
 
-        def made(pose: Pose) -> tuple[Pose, Judge]:
-            judge = self._judge_at(one, pose)
-            start = one.pose_at(pose, grid, judge.pyramid.at(middle)[0].grid)
-            return follow(judge.pyramid, middle, [start]).poses[0], judge
+        def made(pose: Pose) -> tuple[Pose, Pyramid]:
+            pyramid = one.over(self._around(one, pose))
+            start = one.pose_at(pose, grid, pyramid.at(middle)[0].grid)
+            return follow(pyramid, middle, [start]).poses[0], pyramid
 
         with ThreadPoolExecutor(usable_cores()) as threads:
             return [found for found in threads.map(made, poses) if np.isfinite(found[0].score)]
 
-    def _judge_at(self, one: Sought, pose: Pose) -> Judge:
-        target, settings = self._around(one, pose), self.settings
+    def _judge_with(self, one: Sought, pyramid: Pyramid) -> Judge:
+        settings = self.settings
         patch, radius = settings.patch_m, settings.search_radius_m
         return Judge(
-            Pyramid(one.bev, target),
-            (one.ground, Terrain.of(bare(target), self.scales.terrain_cell_m)),
+            pyramid,
+            (one.ground, Terrain.of(bare(pyramid.target), self.scales.terrain_cell_m)),
             self.scales,
             patch_m=self.scales.patch_m if patch is None else patch,
             search_radius_m=self.scales.search_radius_m if radius is None else radius,
@@ -393,7 +414,8 @@ class _Search:
         pool = Pool.of(judged, self.scales, bound)
         while pool.candidates and not pool.candidates[0].complete:
             at = next(k for k, one in enumerate(judged) if one is pool.candidates[0])
-            judged[at] = self._judge_at(self.both[number], judged[at].pose).judge_one(judged[at].pose)
+            one, pose = self.both[number], judged[at].pose
+            judged[at] = self._judge_with(one, one.over(self._around(one, pose))).judge_one(pose)
             pool = Pool.of(judged, self.scales, bound)
         self.pools[number] = pool
 
