@@ -52,6 +52,15 @@ VERBS = {
         "mtpcr_geo.cli.check:command",
         "Report what one or two clouds are and what is wrong with them, before they are registered.",
     ),
+    "survey": Verb(
+        "mtpcr_geo.cli.survey:command",
+        "Make a mosaic of height rasters of many TILES, once, to register scans against.",
+        more=True,
+    ),
+    "batch": Verb(
+        "mtpcr_geo.cli.batch:command",
+        "Register many sources, each to its target or to a survey; write a table and a map of all.",
+    ),
     "apply": Verb(
         "mtpcr_geo.cli.apply:command", "Move a cloud by the transform of a registration, streamed."
     ),

@@ -7,6 +7,7 @@ import typer
 from mtpcr_geo.cli.options import RegisterVerb
 from mtpcr_geo.cli.parameters import command_of
 from mtpcr_geo.cli.shared import end_with, progress_bars
+from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.pipeline.options import PriorOptions, RegisterOptions
 
 
@@ -20,21 +21,35 @@ def run(options: RegisterVerb) -> None:
         mtpcr-geo register ground.laz aerial.laz -o out
         mtpcr-geo register scan.laz tile.laz -o out --source-crs local --overwrite
         mtpcr-geo register scan.laz tile.laz -o out --source-crs local --near 4.895 52.37 --near-crs EPSG:4326
+        mtpcr-geo register scan.laz survey -o out --near 4.895 52.37 --near-crs EPSG:4326 --within 100
         mtpcr-geo register ground.laz aerial.laz -o out --dump-pipeline > mine.json
 
     """
     from mtpcr_geo.cli.summary import print_registration
     from mtpcr_geo.pipeline.grammar import dump
     from mtpcr_geo.registration import build_pipeline, read_options, register
+    from mtpcr_geo.survey import is_survey
 
     given = {name: getattr(options, name) for name in RegisterOptions.model_fields}
     if options.no_prior:
         given |= PriorOptions().model_dump()
+    in_survey = is_survey(options.target)
+    if options.dump_pipeline and in_survey:
+        raise OptionError(
+            "--dump-pipeline does not go with a survey as the target: where to cut it is found by a search"
+        )
     if options.dump_pipeline:
         typer.echo(dump(build_pipeline(options.source, options.target, options.out, read_options(given))))
         return
     with progress_bars(options.quiet) as progress:
-        result = register(options.source, options.target, options.out, progress=progress, **given)
+        if in_survey:
+            from mtpcr_geo.survey.register import register_in_survey
+
+            result = register_in_survey(
+                options.source, options.target, options.out, progress=progress, **given
+            )
+        else:
+            result = register(options.source, options.target, options.out, progress=progress, **given)
     if options.as_json:
         typer.echo(result.outputs["run"].read_text(encoding="utf-8"), nl=False)
     elif not options.quiet:

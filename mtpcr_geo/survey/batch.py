@@ -1,0 +1,298 @@
+"""Many registrations: each in a folder of its own, all in one table and on one map.
+
+A job writes its row when it ends, whole or not at all. A batch that is stopped goes on with the jobs that
+have no row, with those that failed, and with those whose files or options have changed since.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.errors import MtpcrError, OutputError, RegistrationError
+from mtpcr_geo.core.paths import read_whole
+from mtpcr_geo.core.progress import NoProgress, Progress
+from mtpcr_geo.registration import Registration, register
+from mtpcr_geo.survey import is_survey
+from mtpcr_geo.survey.engine import engine_of
+from mtpcr_geo.survey.index import write_atomic
+from mtpcr_geo.survey.jobs import Job
+from mtpcr_geo.survey.options import BatchOptions
+from mtpcr_geo.survey.register import register_in_survey
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+    from mtpcr_geo.core.arrays import Floats
+
+TABLE, MAP, MARK = "batch.csv", "batch.gpkg", "batch.json"
+_ROWS, _JOBS = "rows", "jobs"
+DEFAULTS = BatchOptions()
+
+
+@dataclass(frozen=True)
+class Row:
+    """What became of a job: a row of the table.
+
+    Attributes:
+        name, source, target: the job.
+        verdict: accepted, doubtful or refused; "failed" where it could not be run to a verdict.
+        probability: of being right, where there is a verdict by a model.
+        margin, null_ratio: strength over the next distinct pose, and over the mirrored source.
+        x, y: where the middle of the source lies, in the target's CRS.
+        yaw_deg: yaw of the transform.
+        sigma_plan_m: standard deviation of the place, metres.
+        seconds: wall time of the job.
+        reason: the first reason of the verdict, or the error.
+        folder: of the job's files, relative to the batch.
+        T_target_source: 4x4 between the coordinates of the files, row by row; empty where none was found.
+        footprint: outline of the source in the target's CRS, x and y in turns.
+        crs: the target's CRS as WKT; "" where it is local.
+        key: what the job was made of.
+
+    """
+
+    name: str
+    source: str
+    target: str
+    verdict: str
+    probability: float | None = None
+    margin: float | None = None
+    null_ratio: float | None = None
+    x: float | None = None
+    y: float | None = None
+    yaw_deg: float | None = None
+    sigma_plan_m: float | None = None
+    seconds: float = 0.0
+    reason: str = ""
+    folder: str = ""
+    T_target_source: tuple[float, ...] = ()
+    footprint: tuple[float, ...] = ()
+    crs: str = ""
+    key: str = ""
+
+    @property
+    def failed(self) -> bool:
+        """Whether it was not run to a verdict."""
+        return self.verdict == "failed"
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What a batch came to.
+
+    Attributes:
+        rows: of all jobs, in their order.
+        run: how many were run now.
+        table, map: the files.
+
+    """
+
+    rows: tuple[Row, ...]
+    run: int
+    table: Path
+    map: Path
+
+
+@dataclass(frozen=True)
+class _Task:
+    job: Job
+    folder: Path
+
+
+def run_batch(
+    jobs: Sequence[Job],
+    folder: str | os.PathLike[str],
+    options: BatchOptions = DEFAULTS,
+    progress: Progress | None = None,
+) -> Batch:
+    """Run the jobs of a batch that are not done yet, and write its table and its map.
+
+    Args:
+        jobs: what is to be done.
+        folder: of the batch; made if it is not there.
+        options: of the batch.
+        progress: receives the number of jobs done.
+
+    Raises:
+        OutputError: if the folder holds something else, or cannot be written.
+        MissingPartError: if more than one worker is wanted and Dask is not installed.
+
+    """
+    folder = Path(folder)
+    progress = progress or NoProgress()
+    foreign = folder.exists() and not (folder / MARK).is_file()
+    if foreign and not options.overwrite and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError(f"{folder} is there already, and is no batch; name another folder, or --overwrite")
+    write_atomic(folder / MARK, json.dumps({"format": "mtpcr-geo batch", "version": 1}))
+    rows = {job.name: _row_of(folder, job) for job in jobs}
+    left = [_Task(job, folder) for job in jobs if _is_left(rows[job.name], job, options)]
+    try:
+        with engine_of(options, max(len(left), 1)) as engine, progress.task("jobs", len(left)) as advance:
+            for outcome in engine.run(do, left, options.retries):
+                row = outcome.made
+                if row is None:
+                    row = _failed(outcome.item.job, outcome.error or "")
+                    _write_row(folder, row)
+                rows[row.name] = row
+                advance(1)
+    finally:
+        done = tuple(row for row in rows.values() if row is not None)
+        table = write_table(folder / TABLE, done)
+        chart = write_map(folder / MAP, done)
+    return Batch(done, len(left), table, chart)
+
+
+def do(task: _Task) -> Row:
+    """Run one job, and write its row; what a user can cause fails the job alone."""
+    job, folder = task.job, task.folder / _JOBS / task.job.name
+    started = time.perf_counter()
+    given = {"recording": False, **job.options}
+    try:
+        # what an earlier try of this job left gives way
+        run_one = register_in_survey if is_survey(job.target) else register
+        result = run_one(job.source, job.target, folder, overwrite=True, **given)
+        row = _judged(job, result)
+    except RegistrationError as error:
+        # a survey that has no place for it refuses it, as a target does
+        row = replace(_failed(job, str(error)), verdict="refused")
+    except MtpcrError as error:
+        row = _failed(job, f"{type(error).__name__}: {error}")
+    seconds = round(time.perf_counter() - started, 3)
+    row = replace(row, seconds=seconds, folder=f"{_JOBS}/{job.name}" if folder.is_dir() else "")
+    _write_row(task.folder, row)
+    return row
+
+
+def _is_left(row: Row | None, job: Job, options: BatchOptions) -> bool:
+    return row is None or row.failed or options.overwrite or row.key != job.key
+
+
+def _failed(job: Job, why: str) -> Row:
+    return Row(job.name, str(job.source), str(job.target), "failed", reason=why, key=job.key)
+
+
+def _judged(job: Job, result: Registration) -> Row:
+    verdict, pair, T = result.verdict, result.pair, result.T_target_source
+    metrics = verdict.metrics
+    row = Row(
+        job.name,
+        str(job.source),
+        str(job.target),
+        verdict.name,
+        metrics.get("probability"),
+        metrics.get("hypothesis_margin"),
+        metrics.get("null_ratio"),
+        sigma_plan_m=metrics.get("sigma_plan_m"),
+        reason=verdict.reasons[0] if verdict.reasons else "",
+        key=job.key,
+    )
+    if pair is None or T is None or pair.T_target_source is None:
+        return row
+    outline = _outline(pair.source.sample)
+    placed = pair.target.link.to_file(transforms.apply(pair.T_target_source, outline))
+    x, y = placed[:-1, :2].mean(axis=0)
+    crs = pair.target.link.file_crs
+    return replace(
+        row,
+        x=float(x),
+        y=float(y),
+        yaw_deg=float(np.degrees(transforms.yaw_of(pair.T_target_source[:3, :3]))),
+        T_target_source=tuple(float(value) for value in T.ravel()),
+        footprint=tuple(float(value) for value in placed[:, :2].ravel()),
+        crs="" if crs is None else crs.to_wkt(),
+    )
+
+
+def _outline(sample: Floats) -> Floats:
+    """Return the convex outline of points in plan, closed, (n, 3) at their mean height."""
+    from scipy.spatial import ConvexHull
+
+    xy = sample[:, :2]
+    hull = xy[ConvexHull(xy).vertices]
+    ring = np.vstack([hull, hull[:1]])
+    return np.column_stack([ring, np.full(len(ring), sample[:, 2].mean())])
+
+
+def _row_path(folder: Path, name: str) -> Path:
+    return folder / _ROWS / f"{name}.json"
+
+
+def _write_row(folder: Path, row: Row) -> None:
+    write_atomic(_row_path(folder, row.name), json.dumps(asdict(row), indent=1))
+
+
+def _row_of(folder: Path, job: Job) -> Row | None:
+    """Return the row of a job; None where there is none that can be read."""
+    try:
+        data = json.loads(read_whole(_row_path(folder, job.name)))
+        lists = {key: tuple(value) for key, value in data.items() if isinstance(value, list)}
+        return Row(**{**data, **lists})
+    except (OSError, ValueError, TypeError):
+        return None
+
+
+def write_table(path: Path, rows: Sequence[Row]) -> Path:
+    """Write the table of a batch as CSV, a row a job."""
+    names = [name for name in Row.__dataclass_fields__ if name not in ("footprint", "crs", "key")]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(names)
+    for row in rows:
+        values: list[Any] = []
+        for name in names:
+            value = getattr(row, name)
+            values.append(" ".join(f"{v:.17g}" for v in value) if isinstance(value, tuple) else value)
+        writer.writerow(values)
+    write_atomic(path, text.getvalue())
+    return path
+
+
+def write_map(path: Path, rows: Sequence[Row]) -> Path:
+    """Write the outlines of the sources where they were placed, with verdict and probability, as GeoPackage.
+
+    The map is in the CRS of the first target; what was placed in another is brought there.
+    """
+    from pyproj import CRS
+
+    from mtpcr_geo.export.geopackage import Layer, write_geopackage
+
+    placed = [row for row in rows if row.footprint]
+    crs = CRS.from_wkt(placed[0].crs) if placed and placed[0].crs else None
+    shown = [row for row in placed if bool(row.crs) == (crs is not None)]
+    fields = {
+        name: np.array([getattr(row, name) for row in shown], np.str_)
+        for name in ("name", "verdict", "source", "target", "reason", "folder")
+    } | {
+        name: np.array([np.nan if getattr(row, name) is None else getattr(row, name) for row in shown])
+        for name in ("probability", "margin", "null_ratio", "yaw_deg", "sigma_plan_m", "seconds")
+    }
+    outlines = [_in_crs(row, crs) for row in shown]
+    layer = Layer("footprints", "POLYGON", outlines, fields, "outlines of the sources where they were placed")
+    part = path.with_name(f".{path.stem}.part-{os.getpid()}{path.suffix}")
+    try:
+        write_geopackage(part, [layer], crs)
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+    return path
+
+
+def _in_crs(row: Row, crs: CRS | None) -> Floats:
+    from pyproj import Transformer
+
+    ring = np.array(row.footprint).reshape(-1, 2)
+    if crs is None or row.crs == crs.to_wkt():
+        return ring
+    moved = Transformer.from_crs(row.crs, crs, always_xy=True).transform(ring[:, 0], ring[:, 1])
+    return np.column_stack(moved)

@@ -1,0 +1,144 @@
+"""The jobs of a batch: one source each, its target and options, from a table or a folder."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError
+from mtpcr_geo.core.paths import read_whole, real
+from mtpcr_geo.io.formats import files_at
+from mtpcr_geo.io.many import output_names
+from mtpcr_geo.pipeline.options import RegisterOptions
+from mtpcr_geo.registration import read_options
+from mtpcr_geo.survey import is_survey
+from mtpcr_geo.survey.index import INDEX
+
+OWN_COLUMNS = ("name", "source", "target")
+_OF_THE_BATCH = ("overwrite",)
+_PAIRS = ("near",)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One registration of a batch.
+
+    Attributes:
+        name: of its folder and its row.
+        source, target: the clouds; the target may be a survey.
+        options: fields of `RegisterOptions` that are not at their defaults.
+
+    """
+
+    name: str
+    source: Path
+    target: Path
+    options: Mapping[str, Any]
+
+    @property
+    def key(self) -> str:
+        """What changes when the job would give another result: its files, its options."""
+        about = {
+            "source": _states(self.source),
+            "target": _states(self.target / INDEX if is_survey(self.target) else self.target),
+            "options": dict(self.options),
+        }
+        return sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def jobs_of(path: Path, target: Path | None, common: Mapping[str, Any]) -> list[Job]:
+    """Read the jobs of a batch.
+
+    Args:
+        path: a table (CSV) with a row a job, or a folder, pattern or list of sources.
+        target: of the jobs that name none.
+        common: options of all jobs; columns of the table take precedence.
+
+    Raises:
+        InputError: if the table cannot be read, or names no job.
+        OptionError: if a column is no option, a value is none of it, or a target is missing.
+
+    """
+    if path.suffix.lower() == ".csv" and path.is_file():
+        return _of_table(path, target, common)
+    sources = files_at(path)
+    if target is None:
+        raise OptionError("name the target of the sources: --target FILE, or the folder of a survey")
+    names = [_name(Path(name).stem) for name in output_names(sources)]
+    options = _given(common)
+    return [Job(name, source, target, options) for name, source in zip(names, sources, strict=True)]
+
+
+def _of_table(path: Path, target: Path | None, common: Mapping[str, Any]) -> list[Job]:
+    try:
+        text = read_whole(path).decode("utf-8-sig")
+        rows = list(csv.DictReader(io.StringIO(text), strict=True))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"cannot read the table {path} ({error}); give CSV with a row a job") from error
+    if not rows:
+        raise InputError(f"the table {path} has no rows; give a row a job, below a row of column names")
+    if "source" not in rows[0]:
+        raise InputError(
+            f"the table {path} has no column source; its columns are {', '.join(map(str, rows[0]))}"
+        )
+    jobs: list[Job] = []
+    taken: set[str] = set()
+    for number, row in enumerate(rows, start=2):
+        where = f"{path}, line {number}"
+        if None in row:
+            raise InputError(f"{where} has more values than there are columns")
+        values = {key.strip(): (text or "").strip() for key, text in row.items()}
+        if not values["source"]:
+            raise InputError(f"{where} names no source")
+        named = values.get("target") or ""
+        if not named and target is None:
+            raise OptionError(f"{where} names no target; add a column target, or give --target")
+        source = path.parent / values["source"]
+        options = {key: _value(key, text) for key, text in values.items() if text and key not in OWN_COLUMNS}
+        try:
+            given = _given({**common, **options})
+        except MtpcrError as error:
+            raise OptionError(f"{where}: {error}") from None
+        name = _name(values.get("name") or source.stem)
+        if name.lower() in taken:
+            raise InputError(f"{where}: there is a job {name} already; add a column name")
+        taken.add(name.lower())
+        jobs.append(Job(name, source, path.parent / named if named else Path(target or ""), given))
+    return jobs
+
+
+def _given(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options that are not at their defaults, checked."""
+    wrong = next((key for key in options if key in _OF_THE_BATCH), None)
+    if wrong is not None:
+        raise OptionError(f"{wrong} is an option of the whole batch, and of no job")
+    read = read_options(dict(options))
+    return read.model_dump(mode="json", exclude_defaults=True)
+
+
+def _value(name: str, text: str) -> Any:
+    if name in _PAIRS:
+        return [part for part in re.split(r"[\s;,]+", text) if part]
+    field = RegisterOptions.model_fields.get(name)
+    if field is not None and field.annotation is bool:
+        return {"": False, "yes": True, "no": False}.get(text.lower(), text)
+    return text
+
+
+def _name(text: str) -> str:
+    """Return a name that a folder may have."""
+    return re.sub(r"[^\w.+-]+", "_", text).strip(".") or "job"
+
+
+def _states(path: Path) -> list[tuple[str, int, int]]:
+    try:
+        return [(str(real(one)), one.stat().st_size, one.stat().st_mtime_ns) for one in files_at(path)]
+    except (OSError, InputError):
+        return [(str(path), -1, -1)]

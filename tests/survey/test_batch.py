@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+import csv
+import json
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_survey import town_source, town_target, write_tile
+from typer.testing import CliRunner
+
+from mtpcr_geo.cli.app import app
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.errors import InputError, OptionError, OutputError
+from mtpcr_geo.survey.batch import run_batch
+from mtpcr_geo.survey.jobs import jobs_of
+from mtpcr_geo.survey.options import BatchOptions
+
+HERE = BatchOptions(workers=1)
+
+
+@pytest.fixture(scope="module")
+def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("clouds")
+    write_tile(folder / "target.laz", town_target(points=30_000))
+    write_tile(folder / "scan.laz", town_source()[0], None)
+    write_tile(folder / "scan2.laz", town_source()[0][::2], None)
+    (folder / "broken.laz").write_bytes((folder / "scan.laz").read_bytes()[:5000])
+    return folder
+
+
+def write_table(folder: Path, *rows: str) -> Path:
+    path = folder / "jobs.csv"
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return path
+
+
+def test_a_table_gives_each_job_its_options(clouds: Path) -> None:
+    table = write_table(
+        clouds,
+        "name,source,target,source_crs,near,within,seed,force",
+        "first,scan.laz,target.laz,local,367000 5820000,40,3,true",
+        ",scan2.laz,,,,,,",
+    )
+    first, second = jobs_of(table, clouds / "target.laz", {"source_crs": "EPSG:25833"})
+    assert first.name == "first"
+    assert first.target == clouds / "target.laz"
+    assert first.options == {
+        "source_crs": "local", "near": [367000.0, 5820000.0], "within": 40.0, "seed": 3, "force": True,
+    }  # fmt: skip
+    assert (second.name, second.options) == ("scan2", {"source_crs": "EPSG:25833"})
+    assert first.key != second.key
+
+
+@pytest.mark.parametrize(
+    ("rows", "error", "says"),
+    [
+        (("source,target,wihtin", "a.laz,b.laz,3"), OptionError, "within"),
+        (("source,target,seed", "a.laz,b.laz,x"), OptionError, "line 2: option 'seed'"),
+        (("source,target,overwrite", "a.laz,b.laz,true"), OptionError, "whole batch"),
+        (("cloud,target", "a.laz,b.laz"), InputError, "no column source"),
+        (("source",), InputError, "no rows"),
+        (("source", "a.laz"), OptionError, "--target"),
+        (("source,target", "a.laz,b.laz", "a.laz,c.laz"), InputError, "a job a already"),
+        (("source,target", "a.laz,b.laz,c"), InputError, "more values"),
+    ],
+)
+def test_a_table_that_is_wrong_is_refused(
+    rows: tuple[str, ...], error: type[Exception], says: str, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=says):
+        jobs_of(write_table(tmp_path, *rows), None, {})
+
+
+def test_a_name_is_no_path(tmp_path: Path) -> None:
+    table = write_table(tmp_path, "name,source,target", "../../x y,a.laz,b.laz")
+    assert jobs_of(table, None, {})[0].name == "_.._x_y"
+
+
+def test_a_batch_runs_goes_on_and_tells_failures(clouds: Path, tmp_path: Path) -> None:
+    table = write_table(clouds, "source,target", "scan.laz,target.laz", "broken.laz,target.laz")
+    jobs = jobs_of(table, None, {"source_crs": "local"})
+    folder = tmp_path / "batch"
+    batch = run_batch(jobs, folder, HERE)
+    good, bad = batch.rows
+    assert batch.run == 2
+    assert good.verdict == "accepted", good.reason
+    assert bad.verdict == "failed"
+    assert "broken.laz" in bad.reason
+    T = np.array(good.T_target_source).reshape(4, 4)
+    middle = town_source()[0].mean(axis=0)[None]
+    gap = transforms.apply(T, middle) - transforms.apply(town_source()[1], middle)
+    assert np.linalg.norm(gap) < 0.2
+    assert (folder / good.folder / "run.json").is_file()
+    with (folder / "batch.csv").open(newline="", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(row["name"], row["verdict"]) for row in rows] == [("scan", "accepted"), ("broken", "failed")]
+    assert float(rows[0]["probability"]) == good.probability
+    with sqlite3.connect(folder / "batch.gpkg") as base:
+        shown = base.execute("SELECT name, verdict FROM footprints").fetchall()
+        assert base.execute("SELECT srs_id FROM gpkg_geometry_columns").fetchone() == (25833,)
+    base.close()
+    assert shown == [("scan", "accepted")]
+
+    # what is done is not done again; what failed is
+    (clouds / "broken.laz").write_bytes((clouds / "scan2.laz").read_bytes())
+    row_file = folder / "rows" / "scan.json"
+    before = row_file.stat().st_mtime_ns
+    again = run_batch(jobs_of(table, None, {"source_crs": "local"}), folder, HERE)
+    assert (again.run, row_file.stat().st_mtime_ns) == (1, before)
+    assert [row.verdict for row in again.rows] == ["accepted", "accepted"]
+    # another option is another job
+    other = jobs_of(table, None, {"source_crs": "local", "seed": 1})
+    assert other[0].key != jobs[0].key
+
+
+def test_a_foreign_folder_is_left_alone(clouds: Path, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    jobs = jobs_of(clouds / "scan.laz", clouds / "target.laz", {})
+    with pytest.raises(OutputError, match="is no batch"):
+        run_batch(jobs, tmp_path, HERE)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_the_command_says_what_failed(clouds: Path, tmp_path: Path) -> None:
+    table = write_table(tmp_path, "source,target", f"{clouds / 'none.laz'},{clouds / 'target.laz'}")
+    result = CliRunner().invoke(app, ["batch", str(table), "-o", str(tmp_path / "out"), "--workers", "1"])
+    assert result.exit_code == 5
+    assert "1 failed" in result.stdout
+    assert "none.laz" in result.stderr
+    assert json.loads((tmp_path / "out" / "rows" / "none.json").read_text())["verdict"] == "failed"
