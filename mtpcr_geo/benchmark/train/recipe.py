@@ -42,12 +42,12 @@ class Recipe:
     seed: int = 0
     sites: int = 21
     draws: int = 4
-    feature_steps: int = 2000
+    feature_steps: int = 1200
     batch: int = 8
     size: int = 96
     width: int = 96
-    matcher_pairs: int = 1200
-    matcher_epochs: int = 5
+    matcher_pairs: int = 600
+    matcher_epochs: int = 6
     matcher_size: int = 256
     keypoints: int = 256
     threads: int = 1
