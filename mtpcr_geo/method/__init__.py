@@ -14,7 +14,7 @@ Step               Equation  Function                                 Paper's fo
 3 Grey values      Eq. 3     `images.grey`                            printed: True, False
 4 Enhancement      Eq. 4     `images.enhance`                         gain: "saturated", "normalised"
 3 and 4 in one     Eq. 3-4   `images.image_of`                        look: "paper", "band_pass", ...
-5 Matching                   `mtpcr_geo.match.registry.make_matcher`  name: "superpoint", "correlation"
+5 Matching                   `mtpcr_geo.match.registry.make_matcher`  name: "superpoint", "bev", ...
 6 FOCUS                      `focus.focus`                            settings: theta, radius_m, finer
 7 Inverse mapping  Eq. 5     `inverse_mapping.inverse_mapping`        pixel: "printed", "ceil", "centre"
                              `inverse_mapping.tie_points_of`          surface: "grey", "top", "ground"
@@ -26,7 +26,8 @@ Step               Equation  Function                                 Paper's fo
 
 Eq. 3 and Eq. 5 cannot work as printed: ``printed=True`` leaves an image of 0 and 255, and ``pixel="printed"``
 puts all points on one line. The profile "paper" of a registration therefore takes ``printed=False`` and
-``pixel="ceil"``, and the paper's form of everything else.
+``pixel="ceil"``, and the paper's form of everything else. The one more exception is the image of Eq. 3 and 4:
+a learned matcher whose weights were trained on another one ("bev" on "band_pass") is shown that.
 
 Not in the paper: `overlap` (the ground that both clouds see), `downsample` (thinning by voxels),
 `neighbourhoods` (the shape of a point's surroundings), the settling of heights on the ground in `refine`, and

@@ -340,8 +340,7 @@ class MethodOptions(PriorOptions):
     matcher: Annotated[
         str | None,
         Field(
-            description=f"{description_of(MatcherName)}; if not given correlation, in the profile paper "
-            "superpoint"
+            description=f"{description_of(MatcherName)}; if not given correlation, in the profile paper bev"
         ),
         Shown(MATCHING),
     ] = None

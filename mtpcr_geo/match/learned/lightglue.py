@@ -48,8 +48,8 @@ class LightGlue:
         if not len(source) or not len(target):
             return none
         matches, scores = self.graph.run(
-            kpts0=normalised(source.px, shapes[0])[None],
-            kpts1=normalised(target.px, shapes[1])[None],
+            kpts0=self._places(source.px, shapes[0])[None],
+            kpts1=self._places(target.px, shapes[1])[None],
             desc0=source.descriptors[None],
             desc1=target.descriptors[None],
         )
@@ -64,6 +64,10 @@ class LightGlue:
             raise InputError(f"{self.graph.path} matches keypoints that it was not given")
         keep = scores > self.model.score_threshold
         return matches[keep].astype(np.int64), scores[keep].astype(np.float64)
+
+    def _places(self, px: Floats, shape: tuple[int, int]) -> NDArray[np.float32]:
+        scale = self.model.scale_px
+        return normalised(px, shape) if scale is None else np.asarray(px / scale, np.float32)
 
 
 def normalised(px: Floats, shape: tuple[int, int]) -> NDArray[np.float32]:

@@ -1,7 +1,8 @@
 """Descriptions of learned models: small TOML files that say what a model's files are and how to feed them.
 
 Some come with the package; a user adds others by putting ``NAME.toml`` beside the model files in the models
-folder, and matches with ``--matcher NAME``. The package ships no weights.
+folder, and matches with ``--matcher NAME``. The package ships weights of its own, trained by
+`mtpcr_geo.benchmark.train`, and nobody else's; a file of the same name in the models folder goes before them.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from mtpcr_geo.core.errors import MissingPartError, OptionError
 from mtpcr_geo.core.system import sha256
+from mtpcr_geo.core.types import Look
 
 VARIABLE = "MTPCR_GEO_MODELS"
 _LONGEST, _MOST_DOTS = 20_000, 200
@@ -71,6 +73,12 @@ class MatcherFile(_Part):
         description="orientations are compared by so many of the best keypoints; attention takes time by "
         "their square. The best orientation is matched with all",
     )
+    scale_px: float | None = Field(
+        None,
+        gt=0,
+        description="places are given in pixels over this many; if not given, as LightGlue does: from the "
+        "middle of the image, over half of its longer edge",
+    )
     names: dict[str, str] = Field(
         {}, description="the graph's own names where they differ: kpts0, kpts1, desc0, desc1, matches, scores"
     )
@@ -114,6 +122,11 @@ class ModelDescription(_Part):
     title: str
     kind: Literal["keypoints", "fused"]
     any_yaw: bool = Field(False, description="finds its way at any angle, so that no sweep is needed")
+    look: Look | None = Field(
+        None,
+        description="image that the weights were trained on, and that profiles show it; if not given, the "
+        "profile's own",
+    )
     extractor: ExtractorFile | None = None
     matcher: MatcherFile | None = None
     nearest_neighbours: NearestFile | None = None
@@ -167,25 +180,45 @@ def descriptions(folder: Path | None) -> dict[str, ModelDescription]:
 
 
 def path_of(file: str, model: ModelDescription, folder: Path | None) -> Path:
-    """Find one of a model's files.
+    """Find one of a model's files: in the folder, else among those that the package ships.
 
     Raises:
         MissingPartError: naming the file, where it was looked for, and who publishes it.
 
     """
+    found = _present(file, folder)
+    if found is not None:
+        return found
     where = f"publishers: {model.origin.project}"
     if folder is None:
         raise MissingPartError(
             f"{model.title} needs the file {file}, and no models folder is named; put the file in a "
             f"folder and name it by --models or {VARIABLE} ({where})"
         )
-    path = folder / file
-    if not path.is_file():
-        raise MissingPartError(
-            f"{model.title} needs {path}, which is not there ({where}); `mtpcr-geo models` lists what is, "
-            "and --matcher rootsift needs no file"
-        )
-    return path
+    raise MissingPartError(
+        f"{model.title} needs {folder / file}, which is not there ({where}); `mtpcr-geo models` lists what "
+        "is, and --matcher bev or rootsift needs no file"
+    )
+
+
+def look_of(name: str, folder: Path | None) -> Look | None:
+    """Return the image that a learned matcher of that name was trained on; None where any will do.
+
+    A folder that is not there is for the matcher to report, where it needs one.
+
+    Raises:
+        OptionError: if a description in the folder is wrong.
+
+    """
+    model = descriptions(folder if folder is not None and folder.is_dir() else None).get(name)
+    return model.look if model is not None else None
+
+
+def _present(file: str, folder: Path | None) -> Path | None:
+    """Return where a file is, in the folder or in the package; None if it is in neither."""
+    shipped = Path(str(resources.files("mtpcr_geo.match.learned").joinpath("weights", file)))
+    places = [shipped] if folder is None else [folder / file, shipped]
+    return next((path for path in places if path.is_file()), None)
 
 
 def inventory(folder: Path | None) -> Iterator[dict[str, Any]]:
@@ -193,9 +226,8 @@ def inventory(folder: Path | None) -> Iterator[dict[str, Any]]:
     for name, model in descriptions(folder).items():
         files: dict[str, dict[str, Any] | None] = {}
         for file in model.files:
-            path = folder / file if folder is not None else None
-            known = path is not None and path.is_file()
-            files[file] = {"bytes": path.stat().st_size, "sha256": sha256(path)} if path and known else None
+            path = _present(file, folder)
+            files[file] = None if path is None else {"bytes": path.stat().st_size, "sha256": sha256(path)}
         yield {
             "name": name,
             "title": model.title,

@@ -16,6 +16,7 @@ from mtpcr_geo.io.many import ManyFiles, is_many, output_names
 from mtpcr_geo.io.memory import cloud_of
 from mtpcr_geo.io.write import is_copc
 from mtpcr_geo.io.write_any import ENDINGS
+from mtpcr_geo.match.learned.model_cards import look_of, models_folder
 from mtpcr_geo.pipeline.file_options import AlsoFormat
 from mtpcr_geo.pipeline.options import OUTPUT_NAMES, MethodOptions, PriorOptions, RegisterOptions
 from mtpcr_geo.pipeline.stage import Stage
@@ -151,7 +152,10 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
         if options.res
         else BevOptions(cell=options.cell or 1.0, pixel="ceil")
     )
-    match = MatchOptions(method=options.matcher or "superpoint", models=options.models, seed=seed)
+    matcher = options.matcher or "bev"
+    match = MatchOptions(method=matcher, models=options.models, seed=seed)
+    # weights trained on one image see nothing in another; other matchers get the paper's (Eq. 3 and 4)
+    look = (look_of(matcher, models_folder(options.models)) or "paper") if options.enhance else "grey"
     refine = RefineOptions(
         method="point_to_point",
         ground=False,
@@ -160,7 +164,7 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
     )
     steps: list[Stage] = [
         MakeBev(bev, f"{prefix}bev"),
-        Enhance(EnhanceOptions(look="paper" if options.enhance else "grey"), f"{prefix}enhance"),
+        Enhance(EnhanceOptions(look=look), f"{prefix}enhance"),
         Match(match, f"{prefix}match"),
     ]
     if options.focus:
