@@ -24,8 +24,10 @@ from mtpcr_geo.pipeline.stages.export import (
     ApplyOptions,
     BevFileOptions,
     FileOptions,
+    ProjectFileOptions,
     TransformFileOptions,
     WriteBev,
+    WriteProject,
     WriteRecording,
     WriteReport,
     WriteRun,
@@ -284,6 +286,7 @@ def writers_of(
         stages.append(SavedRecording(recording, where["recording"], "recording"))
     return [
         *stages,
+        WriteProject(ProjectFileOptions(filename=where["project"]), "project"),
         WriteReport(FileOptions(filename=where["report"]), "report"),
         WriteRun(FileOptions(filename=where["run"]), "run"),
         Apply(ApplyOptions(force=force), "moved"),
