@@ -46,6 +46,9 @@ SMALLEST_RANGE_M = 1.0
 _SHOWN_PERCENT = (2.0, 98.0)
 _MOST_SAMPLED = 200_000
 _NORMAL, _MULTIPLY = "0", "6"
+_SHADE_OPACITY = 0.6
+# level ground stays nearly as bright as its colour
+_SHADE_BRIGHTNESS = 60
 
 
 def height_limits(tops: Iterable[Image]) -> tuple[float, float]:
@@ -67,7 +70,7 @@ def height_limits(tops: Iterable[Image]) -> tuple[float, float]:
 
 
 def difference_limit(difference: Image) -> float:
-    """Return the difference at which both ends of the ramp lie: what 90 % are below, in decimetres.
+    """Return the difference at which both ends of the ramp lie: what 80 % are below, in decimetres.
 
     Args:
         difference: (h, w) metres, NaN where there is none.
@@ -79,7 +82,7 @@ def difference_limit(difference: Image) -> float:
     known: Floats = np.abs(difference[np.isfinite(difference)]).astype(np.float64)
     if not len(known):
         return LARGEST_DIFFERENCE_M
-    return float(np.clip(np.ceil(np.percentile(known, 90.0) * 10.0) / 10.0, 0.2, LARGEST_DIFFERENCE_M))
+    return float(np.clip(np.ceil(np.percentile(known, 80.0) * 10.0) / 10.0, 0.2, LARGEST_DIFFERENCE_M))
 
 
 def relief_style(low: float, high: float) -> list[Element]:
@@ -92,13 +95,11 @@ def difference_style(limit: float) -> list[Element]:
     return _pipe(_pseudocolour(DIFFERENCE, -limit, limit), _NORMAL)
 
 
-def shade_style(*, multiply: bool = True, exaggeration: float = 1.0) -> list[Element]:
-    """Return the style that shades band 1 as if lit from north-west.
+def shade_style() -> list[Element]:
+    """Return the style that shades band 1 as if lit from north-west, and darkens the layers below.
 
-    Args:
-        multiply: darken the layers below, so that their colours gain relief, instead of hiding them.
-        exaggeration: factor on heights.
-
+    It is half transparent: at the foot of walls the slope between two cells is so steep that full shades
+    would draw every edge in black.
     """
     shade = Element(
         "rasterrenderer",
@@ -106,13 +107,13 @@ def shade_style(*, multiply: bool = True, exaggeration: float = 1.0) -> list[Ele
         band="1",
         azimuth="315",
         angle="45",
-        zfactor=f"{exaggeration:g}",
-        multidirection="1",
-        opacity="1",
+        zfactor="1",
+        multidirection="0",
+        opacity=f"{_SHADE_OPACITY:g}",
         alphaBand="-1",
         nodataColor="",
     )
-    return _pipe(shade, _MULTIPLY if multiply else _NORMAL, brightness=40 if multiply else 0)
+    return _pipe(shade, _MULTIPLY, brightness=_SHADE_BRIGHTNESS)
 
 
 def qml(elements: Iterable[Element]) -> bytes:

@@ -16,7 +16,8 @@ SOURCE, TARGET = "#e66101", "#2166ac"
 LEAST_SPACING_MM = 3.0
 """Points closer together than this on the screen or the page give way to those that stand for them."""
 
-_SPACED = f'"spacing_m" * 1000 / @map_scale >= {LEAST_SPACING_MM:g}'
+# where a picture has no scale, all are drawn
+_SPACED = f'"spacing_m" * 1000 >= {LEAST_SPACING_MM:g} * coalesce(@map_scale, 0)'
 
 Rule = tuple[str, str, Sequence[Element]]
 """A condition, its line of the legend, and the symbol layers."""
@@ -149,7 +150,7 @@ def _line(colour: str, width_mm: float, style: str = "solid") -> Element:
 
 def _fill(colour: str, outline: str) -> Element:
     values = {"style": "no", "outline_color": rgba(colour), "outline_style": outline}
-    return _layer("SimpleFill", {**values, "outline_width": "0.7", "outline_width_unit": "MM"})
+    return _layer("SimpleFill", {**values, "outline_width": "0.5", "outline_width_unit": "MM"})
 
 
 def _generated(expression: str, colour: str) -> Element:

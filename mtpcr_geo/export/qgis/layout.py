@@ -15,19 +15,26 @@ from mtpcr_geo.export.qgis.layers import Extent, Group, MapLayer, extent_element
 NAME = "Registration, A4"
 _MAP, _LEGEND, _LABEL, _PICTURE, _SCALE_BAR, _PAGE = "65639", "65642", "65641", "65640", "65646", "65638"
 _PAGE_MM = (297.0, 210.0)
-_EDGE_MM, _GAP_MM, _TOP_MM, _MAP_HEIGHT_MM = 10.0, 7.0, 38.0, 122.0
+_EDGE_MM, _GAP_MM, _TOP_MM, _MAP_HEIGHT_MM = 10.0, 7.0, 38.0, 132.0
 _SEGMENT_MM = 12.0
-_ROUND = (1.0, 2.0, 2.5, 5.0)
+_ROUND = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.5)
 _ARROW = (
     '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 20 30" width="20" height="30">'
     '<path d="M10 1 17 22 10 17 3 22z" fill="#232323" stroke="#fff" stroke-width="1"/>'
     '<text x="10" y="30" font-size="8" font-family="sans-serif" text-anchor="middle" fill="#232323">N</text>'
     "</svg>"
 )
+_LEGEND_STYLES = (
+    ("title", 8, "0"),
+    ("group", 8, "1"),
+    ("subgroup", 8, "1"),
+    ("symbol", 7, "0.8"),
+    ("symbolLabel", 7, "0.8"),
+)
 _CAPTIONS = {
     "Before": "Before: heights as they came",
     "After": "After: heights, the registered source over the target",
-    "Evidence": "Evidence: height difference, registered minus target, and tie points",
+    "Evidence": "Evidence: height difference, tie points, and their residuals in plan (arrows, longer)",
 }
 
 
@@ -77,8 +84,8 @@ def layout_element(page: Page) -> Element:
         _label(
             layout, f"{group.name} caption", (left, _TOP_MM - 5.0, width, 4.5), caption, points=8, bold=True
         )
-        _scale_bar(layout, group.name, (left, below + 1.0, 60.0, 11.0), scale)
-        _legend(layout, group, (left + 62.0, below + 1.0, width - 62.0, 35.0))
+        _scale_bar(layout, group.name, (left + 2.0, below - 11.0, 60.0, 9.0), scale)
+        _legend(layout, group, (left, below + 2.0, width, 35.0))
     north = (_EDGE_MM + width - 10.0, _TOP_MM + 2.0, 8.0, 12.0)
     picture = _item(layout, _PICTURE, "north", north)
     picture.set("file", "base64:" + base64.b64encode(_ARROW.encode()).decode())
@@ -188,10 +195,13 @@ def _label(
     item = _item(layout, _LABEL, name, place, labelText=text, htmlState="0", halign="1", valign="32")
     item.set("marginX", "0")
     item.set("marginY", "0")
-    weight = "75" if bold else "50"
-    SubElement(item, "LabelFont", description=f"Sans Serif,{points},-1,5,{weight},0,0,0,0,0", style="")
+    SubElement(item, "LabelFont", description=_font(points, bold), style="")
     SubElement(item, "FontColor", red="35", green="35", blue="35", alpha="255")
     _text_style(item, points, bold)
+
+
+def _font(points: int, bold: bool) -> str:
+    return f"Sans Serif,{points},-1,5,{75 if bold else 50},0,0,0,0,0"
 
 
 def _text_style(parent: Element, points: int, bold: bool = False) -> None:
@@ -230,8 +240,10 @@ def _scale_bar(
         boxContentSpace="0.5",
         outlineWidth="0.2",
         alignment="0",
+        background="true",
     )
     _text_style(item, 8)
+    SubElement(item, "BackgroundColor", red="255", green="255", blue="255", alpha="200")
     SubElement(item, "fillColor", red="35", green="35", blue="35", alpha="255")
     SubElement(item, "fillColor2", red="255", green="255", blue="255", alpha="255")
     SubElement(item, "strokeColor", red="35", green="35", blue="35", alpha="255")
@@ -246,28 +258,30 @@ def _legend(layout: Element, group: Group, place: tuple[float, float, float, flo
         place,
         map_uuid=f"{{{uuid5(NAMESPACE_URL, group.name)}}}",
         title="",
-        columnCount="2",
+        columnCount=str(len(_with_legend(group))),
         splitLayer="0",
         equalColumnWidth="0",
         resizeToContents="1",
         legendFilterByAtlas="0",
         symbolWidth="4",
         symbolHeight="3",
-        columnSpace="4",
+        columnSpace="5",
+        maxSymbolSize="0",
+        minSymbolSize="0",
+        symbolAlignment="1",
         boxSpace="0",
         wmsLegendWidth="50",
         wmsLegendHeight="25",
     )
     styles = SubElement(item, "styles")
-    for name, points, margin in (
-        ("title", 8, "0"),
-        ("group", 8, "1"),
-        ("subgroup", 8, "1"),
-        ("symbol", 7, "0.6"),
-        ("symbolLabel", 7, "0.6"),
-    ):
-        style = SubElement(styles, "style", name=name, marginTop=margin, marginLeft="1", indent="0")
-        _text_style(style, points, bold=name == "subgroup")
+    for name, points, margin in _LEGEND_STYLES:
+        style = SubElement(
+            styles, "style", name=name, marginTop=margin, marginLeft="1", indent="0", alignment="1"
+        )
+        bold = name == "subgroup"
+        # QGIS before 3.24 reads the font, later ones the text style
+        SubElement(style, "styleFont", description=_font(points, bold), style="")
+        _text_style(style, points, bold)
     tree = SubElement(item, "layer-tree-group")
     for layer in _with_legend(group):
         one = SubElement(
@@ -283,10 +297,19 @@ def _legend(layout: Element, group: Group, place: tuple[float, float, float, flo
         )
         properties = SubElement(SubElement(one, "customproperties"), "Option", type="Map")
         SubElement(properties, "Option", name="cached_name", type="QString", value=layer.title)
+        if not layer.geometry:
+            difference = layer.key.startswith("difference")
+            note = "registered minus target" if difference else "highest in each cell"
+            # instead of the number and the description of the band
+            SubElement(properties, "Option", name="legend/label-0", type="QString", value=note)
 
 
 def _with_legend(group: Group) -> list[MapLayer]:
-    """Return the layers whose colours mean something: of several rasters of heights the first."""
-    shown = [layer for layer in group.layers() if layer.shown and not layer.key.endswith("_shading")]
+    """Return the layers whose colours mean something: of several rasters of heights the first.
+
+    The arrows have the colours of the tie points.
+    """
+    skipped = ("_shading", "_links")
+    shown = [layer for layer in group.layers() if layer.shown and not layer.key.endswith(skipped)]
     first = next((layer for layer in shown if layer.title == "Heights"), None)
     return [layer for layer in shown if layer.title != "Heights" or layer is first]

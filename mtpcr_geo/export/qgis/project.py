@@ -136,7 +136,7 @@ def _groups(rasters: Mapping[str, LayerFile], tables: Mapping[str, MapLayer]) ->
     if "difference" in rasters:
         if fixed is not None:
             evidence.append(shade_layer(fixed, "evidence_target"))
-        title = "Height difference, registered minus target"
+        title = "Height difference"
         evidence += raster_layers(rasters["difference"], "difference", title, shaded=False)
     elif fixed is not None and evidence:
         evidence.append(shade_layer(fixed, "evidence_target"))
