@@ -78,7 +78,7 @@ def _parameter(name: str, field: FieldInfo, verb: str) -> dict[str, Any]:
         "choices": choices,
         "default": None if field.is_required() else field.default,
         "required": field.is_required(),
-        "label": description[:1].upper() + description[1:].partition(";")[0].partition(":")[0],
+        "label": description[:1].upper() + description[1:].partition(";")[0].partition(": ")[0],
         "help": help_of(field),
         "advanced": not field.is_required() and shown.group not in (INPUTS, OUTPUT),
     }

@@ -70,19 +70,21 @@ def height_limits(tops: Iterable[Image]) -> tuple[float, float]:
 
 
 def difference_limit(difference: Image) -> float:
-    """Return the difference at which both ends of the ramp lie: what 80 % are below, in decimetres.
+    """Return the difference at which both ends of the ramp lie: five times the noise of those that agree.
 
     Args:
         difference: (h, w) metres, NaN where there is none.
 
     Returns:
-        Metres, from 0.2 to 1.
+        Whole decimetres, from 0.2 to 1 m.
 
     """
-    known: Floats = np.abs(difference[np.isfinite(difference)]).astype(np.float64)
+    known: Floats = difference[np.isfinite(difference)].astype(np.float64)
     if not len(known):
         return LARGEST_DIFFERENCE_M
-    return float(np.clip(np.ceil(np.percentile(known, 80.0) * 10.0) / 10.0, 0.2, LARGEST_DIFFERENCE_M))
+    # walls and crowns differ by metres: the median of what is left knows nothing of them
+    noise = 1.4826 * float(np.median(np.abs(known - np.median(known))))
+    return float(np.clip(np.ceil(50.0 * noise) / 10.0, 0.2, LARGEST_DIFFERENCE_M))
 
 
 def relief_style(low: float, high: float) -> list[Element]:
@@ -113,7 +115,7 @@ def shade_style() -> list[Element]:
         alphaBand="-1",
         nodataColor="",
     )
-    return _pipe(shade, _MULTIPLY, brightness=_SHADE_BRIGHTNESS)
+    return _pipe(shade, _MULTIPLY, brightness=_SHADE_BRIGHTNESS, smooth=True)
 
 
 def qml(elements: Iterable[Element]) -> bytes:
@@ -151,17 +153,22 @@ def rgba(colour: str, alpha: int = 255) -> str:
     return f"{red},{green},{blue},{alpha}"
 
 
-def _pipe(renderer: Element, blend: str, brightness: int = 0) -> list[Element]:
+def _pipe(renderer: Element, blend: str, brightness: int = 0, smooth: bool = False) -> list[Element]:
+    """Return a layer's pipe and its blend mode; a smooth one takes heights between the cells' centres."""
     pipe = Element("pipe")
+    # colours show the cells as they are; shades need slopes, and a cell drawn larger has none but at its edge
+    methods = {
+        "zoomedInResamplingMethod": "cubic" if smooth else "nearestNeighbour",
+        "zoomedOutResamplingMethod": "nearestNeighbour",
+    }
+    enabled = "true" if smooth else "false"
     provider = SubElement(pipe, "provider")
-    # the overviews hold the highest, and interpolation would make heights that nobody measured
-    nearest = {f"zoomed{way}ResamplingMethod": "nearestNeighbour" for way in ("In", "Out")}
-    SubElement(provider, "resampling", enabled="false", maxOversampling="2", **nearest)
+    SubElement(provider, "resampling", {"enabled": enabled, "maxOversampling": "2", **methods})
     pipe.append(renderer)
     SubElement(pipe, "brightnesscontrast", brightness=str(brightness), contrast="0", gamma="1")
     SubElement(pipe, "huesaturation", saturation="0", grayscaleMode="0", colorizeOn="0", invertColors="0")
     SubElement(pipe, "rasterresampler", maxOversampling="2")
-    SubElement(pipe, "resamplingStage").text = "resamplingFilter"
+    SubElement(pipe, "resamplingStage").text = "provider" if smooth else "resamplingFilter"
     mode = Element("blendMode")
     mode.text = blend
     return [pipe, mode]
@@ -169,15 +176,8 @@ def _pipe(renderer: Element, blend: str, brightness: int = 0) -> list[Element]:
 
 def _pseudocolour(stops: Stops, low: float, high: float) -> Element:
     limits = {"classificationMin": f"{low:.3f}", "classificationMax": f"{high:.3f}"}
-    renderer = Element(
-        "rasterrenderer",
-        type="singlebandpseudocolor",
-        band="1",
-        opacity="1",
-        alphaBand="-1",
-        nodataColor="",
-        **limits,
-    )
+    kind = {"type": "singlebandpseudocolor", "band": "1", "opacity": "1", "alphaBand": "-1"}
+    renderer = Element("rasterrenderer", {**kind, "nodataColor": "", **limits})
     origin = SubElement(renderer, "minMaxOrigin")
     for name, text in (("limits", "None"), ("extent", "WholeRaster"), ("statAccuracy", "Estimated")):
         SubElement(origin, name).text = text

@@ -203,8 +203,8 @@ def _labels(field: str) -> Element:
         textColor=rgba(INK),
         textOpacity="1",
     )
-    rim = {"bufferDraw": "1", "bufferSize": "0.8", "bufferSizeUnits": "MM"}
-    SubElement(text, "text-buffer", **rim, bufferColor=rgba("#ffffff"), bufferOpacity="1")
+    rim = {"bufferDraw": "1", "bufferSize": "0.8", "bufferSizeUnits": "MM", "bufferOpacity": "1"}
+    SubElement(text, "text-buffer", {**rim, "bufferColor": rgba("#ffffff")})
     SubElement(settings, "placement", placement="0", dist="1.8", distUnits="MM")
     SubElement(settings, "rendering", displayAll="0", obstacle="1")
     return labeling

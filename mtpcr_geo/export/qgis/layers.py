@@ -177,7 +177,7 @@ def vector_layers(file: LayerFile, titles: dict[str, str], hidden: Sequence[str]
                 kinds[kind],
                 list(ElementTree.fromstring(style)) if style else [],
                 crs,
-                None if extent[0] is None else tuple(extent),  # type: ignore[arg-type]
+                None if extent[0] is None else tuple(extent),
                 table not in hidden,
             )
     return found

@@ -69,8 +69,8 @@ def layout_element(page: Page) -> Element:
         SubElement(options, "Option", name=name, type="QString", value=value)
 
     wide = _PAGE_MM[0] - 2 * _EDGE_MM
-    _label(layout, "title", (_EDGE_MM, 8.0, wide, 8.0), visible(page.title), points=15, bold=True)
-    _label(layout, "verdict", (_EDGE_MM, 17.0, wide, 15.0), visible(page.sentence), points=9)
+    _label(layout, "title", (_EDGE_MM, 8.0, wide, 8.0), _said(page.title), points=15, bold=True)
+    _label(layout, "verdict", (_EDGE_MM, 17.0, wide, 15.0), _said(page.sentence), points=9)
     width = (wide - _GAP_MM * (len(page.groups) - 1)) / len(page.groups)
     scale = _round_up(_scale(page.extent, width, _MAP_HEIGHT_MM))
     for index, group in enumerate(page.groups):
@@ -97,6 +97,11 @@ def layout_element(page: Page) -> Element:
     return layout
 
 
+def _said(text: str) -> str:
+    """Return a text for a label, with nothing for QGIS to evaluate: names of files come from strangers."""
+    return visible(text).replace("[%", "[ %")
+
+
 def _crs_name(wkt: str | None) -> str:
     if wkt is None:
         return "Local coordinates of the target, metres"
@@ -104,7 +109,7 @@ def _crs_name(wkt: str | None) -> str:
 
     crs = CRS.from_wkt(wkt)
     authority = crs.to_authority(min_confidence=100)
-    return visible(crs.name + (f" ({':'.join(authority)})" if authority is not None else ""))
+    return _said(crs.name + (f" ({':'.join(authority)})" if authority is not None else ""))
 
 
 def _scale(extent: Extent, width_mm: float, height_mm: float) -> float:

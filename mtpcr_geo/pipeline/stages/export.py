@@ -15,6 +15,7 @@ from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.recorder import NullRecorder
 from mtpcr_geo.core.system import peak_memory_mb
 from mtpcr_geo.core.types import Pair, Side, Verdict
+from mtpcr_geo.core.wording import visible
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.pipeline.options import OUTPUT_NAMES, Force
 from mtpcr_geo.pipeline.records import Written
@@ -287,7 +288,8 @@ class WriteProject(EvidenceWriter):
             where = Path(os.path.relpath(final, self.options.filename.parent)).as_posix()
         except ValueError:  # another drive
             where = final.resolve().as_posix()
-        return LayerFile(where if where.startswith("..") or Path(where).is_absolute() else f"./{where}", part)
+        here = "" if where.startswith("..") or Path(where).is_absolute() else "./"
+        return LayerFile(visible(here + where), part)
 
 
 class TransformFileOptions(FileOptions):
