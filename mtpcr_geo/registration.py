@@ -34,6 +34,7 @@ from mtpcr_geo.pipeline.options import OUTPUT_NAMES, RegisterOptions, first_prob
 from mtpcr_geo.pipeline.records import StageRecord
 from mtpcr_geo.pipeline.runner import RunResult, run
 from mtpcr_geo.pipeline.stage import chained
+from mtpcr_geo.pipeline.stages.export import DERIVED_ROLES
 from mtpcr_geo.pipeline.stages.memory import check_two, crs_of_arrays
 from mtpcr_geo.pipeline.stages.steps import (
     further_files,
@@ -427,7 +428,12 @@ def _name_of(path: Path) -> str:
     names = {path.name: name for name, path in OUTPUT_NAMES.items()}
     if path.name.startswith("registered.") and path.name not in names and path.parent.name != "bev":
         return "registered_also"
-    names |= {f"{role}.tif": f"bev_{role}" for role in ("source", "target", "registered")}
+    for role in ("source", "target", *DERIVED_ROLES):
+        names |= {
+            f"{role}.tif": f"bev_{role}",
+            f"{role}.qml": f"style_{role}",
+            f"{role}.tif.points": "points",
+        }
     return names.get(path.name, path.stem)
 
 

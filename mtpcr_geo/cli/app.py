@@ -77,6 +77,10 @@ VERBS = {
         "mtpcr_geo.cli.demo_verb:command",
         "Register a simulated town, scanned from a street and from the air, and compare with the truth.",
     ),
+    "qgis-plugin": Verb(
+        "mtpcr_geo.cli.qgis_plugin:command",
+        "Write a plugin for QGIS that offers register, apply and check in its Processing toolbox.",
+    ),
     "benchmark": Verb(
         "mtpcr_geo.benchmark.command:benchmark",
         "Run methods on pairs with a known transform, from random starts; write tables and plots.",

@@ -191,3 +191,13 @@ class DemoVerb(VerbOptions):
     ] = Path("mtpcr-demo")
     overwrite: Overwrite = False
     quiet: QuietVerdict = False
+
+
+class QgisPluginVerb(VerbOptions):
+    """Options of ``qgis-plugin``."""
+
+    out: Annotated[Path, Field(description="zip to write"), Shown(OUTPUT, ("--out", "-o"))] = Path(
+        "mtpcr_geo_qgis.zip"
+    )
+    overwrite: Overwrite = False
+    quiet: Quiet = False

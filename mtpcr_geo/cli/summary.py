@@ -38,6 +38,7 @@ _OPEN_WITH = {
     "registered_also": "the moved cloud, for other programs",
     "report": "the report, in any browser",
     "recording": "the recording, with: rerun",
+    "project": "before, after and evidence on a map, in QGIS",
     "tie_points": "tie points and footprints, in QGIS",
     "run": "everything as numbers",
 }

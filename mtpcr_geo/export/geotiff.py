@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,34 @@ from mtpcr_geo.core.wording import visible
 from mtpcr_geo.crs import WorkFrame
 from mtpcr_geo.export import overviews
 
-BANDS = (
-    ("highest z in the cell, metres", "metre"),
-    ("lowest z in the cell, metres", "metre"),
-    ("points in the cell", "count"),
-)
-_TILE = 256
+_CREATION = {
+    "blocksize": 256,
+    "compress": "deflate",
+    "level": 4,
+    "num_threads": "ALL_CPUS",
+    "predictor": "floating_point",
+    "bigtiff": "IF_SAFER",
+}
 _SMALLEST_OVERVIEW = 128
 _WARP_CELLS = 500_000
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """One band of a raster file.
+
+    Attributes:
+        values: (h, w) float32, NaN where there is none.
+        description: what the band holds, in a few words.
+        unit: of its values, such as "metre" or "count".
+        pool: how a cell of an overview comes from those that it covers.
+
+    """
+
+    values: Image
+    description: str
+    unit: str
+    pool: overviews.Pool
 
 
 def write_bev(
@@ -39,7 +60,7 @@ def write_bev(
     T_level_work: Floats | None = None,
     tags: Mapping[str, str] | None = None,
 ) -> None:
-    """Write a BEV as a tiled, compressed float32 GeoTIFF with overviews.
+    """Write a BEV as a cloud optimized GeoTIFF, float32, deflated, with overviews.
 
     Bands: highest z, lowest z (both absolute: the origin's z is added; NaN is nodata) and the number of
     points (0 where empty). Cell edges, not centres, carry the geotransform (AREA_OR_POINT=Area). A cell of
@@ -58,39 +79,62 @@ def write_bev(
         OutputError: if the file cannot be written.
 
     """
+    bands = (
+        Band(_absolute(bev.top, frame), "highest z in the cell, metres", "metre", overviews.HIGHEST),
+        Band(_absolute(bev.low, frame), "lowest z in the cell, metres", "metre", overviews.LOWEST),
+        Band(bev.count.astype(np.float32), "points in the cell", "count", overviews.SUM),
+    )
+    meaning = "absolute: highest and lowest z of the points whose plan position falls into the cell"
+    write_raster(
+        path, bands, bev.grid, frame, T_level_work=T_level_work, tags={"HEIGHTS": meaning, **(tags or {})}
+    )
+
+
+def write_raster(
+    path: str | os.PathLike[str],
+    bands: Sequence[Band],
+    grid: Grid,
+    frame: WorkFrame,
+    *,
+    T_level_work: Floats | None = None,
+    tags: Mapping[str, str] | None = None,
+) -> None:
+    """Write bands of one grid as a cloud optimized GeoTIFF.
+
+    Args:
+        path: where to write; no other file is left beside it.
+        bands: what to write; the first is what a program shows that shows one.
+        grid: where they lie, in levelled work coordinates, metres.
+        frame: CRS and origin of the work coordinates.
+        T_level_work: 4x4 from work to levelled coordinates, as in `write_bev`.
+        tags: further tags for the file.
+
+    Raises:
+        OutputError: if the file cannot be written.
+
+    """
     import rasterio
+    from rasterio._err import CPLE_BaseError  # what rasterio.shutil.copy raises, and no RasterioError
+    from rasterio.enums import ColorInterp
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
     from rasterio.io import MemoryFile
 
     level = np.eye(4) if T_level_work is None else np.asarray(T_level_work, np.float64)
     upright = bool(np.array_equal(level, np.eye(4)))
-    grid = bev.grid
     profile: dict[str, Any] = {
         "driver": "GTiff",
         "dtype": "float32",
-        "count": len(BANDS),
+        "count": len(bands),
         "width": grid.width,
         "height": grid.height,
         "nodata": float("nan"),
         "transform": geotransform(grid, frame.origin),
         "crs": frame.crs.to_wkt() if frame.crs is not None and upright else None,
     }
-    creation: dict[str, Any] = {
-        "tiled": True,
-        "blockxsize": _TILE,
-        "blockysize": _TILE,
-        "compress": "deflate",
-        "zlevel": 4,
-        "num_threads": "ALL_CPUS",
-        "predictor": 3,
-        "interleave": "band",
-        "BIGTIFF": "IF_SAFER",
-    }
     every_tag = {
         "AREA_OR_POINT": "Area",
         "TIFFTAG_SOFTWARE": f"mtpcr_geo {__version__}",
         "CELL_SIZE": f"{grid.cell:.17g} metre",
-        "HEIGHTS": "absolute: highest and lowest z of the points whose plan position falls into the cell",
         **_frame_tags(frame, level, upright),
         **(tags or {}),
     }
@@ -98,27 +142,22 @@ def write_bev(
         with rasterio.Env(GDAL_PAM_ENABLED="NO"), warnings.catch_warnings():
             # a local raster with its corner at zero is georeferenced all the same
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            bands = [_absolute(bev.top, frame), _absolute(bev.low, frame), bev.count.astype(np.float32)]
-            levels = overview_levels(grid)
-            if not levels:
-                with rasterio.open(path, "w", **profile, **creation) as out:
-                    _fill(out, bands, every_tag)
-            else:
-                with MemoryFile(ext=".tif") as memory:
-                    with memory.open(**profile, **creation | {"zlevel": 1}) as out:
-                        _fill(out, bands, every_tag)
-                    pools = [overviews.HIGHEST, overviews.LOWEST, overviews.SUM]
-                    overviews.copy_with_overviews(memory.name, Path(path), bands, pools, levels, **creation)
-    except (RasterioError, OSError) as error:
+            with MemoryFile(ext=".tif") as memory:
+                with memory.open(**profile, interleave="band") as out:
+                    out.update_tags(**{key: visible(text) for key, text in every_tag.items()})
+                    # no band is a colour
+                    rest = [ColorInterp.undefined] * (len(bands) - 1)
+                    out.colorinterp = [ColorInterp.gray, *rest]
+                    for index, band in enumerate(bands, start=1):
+                        out.set_band_description(index, band.description)
+                        out.set_band_unit(index, band.unit)
+                        out.write(band.values, index)
+                pools = [band.pool for band in bands]
+                values = [band.values for band in bands]
+                levels = overview_levels(grid)
+                overviews.copy_with_overviews(memory.name, Path(path), values, pools, levels, **_CREATION)
+    except (RasterioError, CPLE_BaseError, OSError) as error:
         raise OutputError(f"cannot write the raster {Path(path)}: {error}") from error
-
-
-def _fill(out: Any, bands: Sequence[Image], tags: Mapping[str, str]) -> None:
-    out.update_tags(**{key: visible(text) for key, text in tags.items()})
-    for index, (band, (text, unit)) in enumerate(zip(bands, BANDS, strict=True), start=1):
-        out.set_band_description(index, text)
-        out.set_band_unit(index, unit)
-        out.write(band, index)
 
 
 def write_side_bev(path: str | os.PathLike[str], side: Side, frame: WorkFrame | None = None) -> None:
@@ -144,10 +183,15 @@ def write_side_bev(path: str | os.PathLike[str], side: Side, frame: WorkFrame | 
     write_bev(path, side.bev, WorkFrame(crs, link.origin), T_level_work=side.T_level_work, tags=tags)
 
 
-def write_registered_bev(path: str | os.PathLike[str], pair: Pair) -> None:
+def write_registered_bev(path: str | os.PathLike[str], pair: Pair, bev: Bev | None = None) -> None:
     """Write the source's BEV as the found transform places it, in the target's CRS, upright.
 
     Laid over the target in a GIS it shows at once whether the registration holds.
+
+    Args:
+        path: where to write.
+        pair: a solved pair.
+        bev: what `registered_bev` made of it, where it is there already.
 
     Raises:
         ValueError: if the pair is not solved or the source has no BEV yet.
@@ -159,7 +203,7 @@ def write_registered_bev(path: str | os.PathLike[str], pair: Pair) -> None:
         "CLOUD": Path(pair.source.cloud.name).name,
         "RESAMPLING": "nearest cell of the source's BEV, moved by the found transform",
     }
-    write_bev(path, registered_bev(pair), pair.frame, tags=tags)
+    write_bev(path, registered_bev(pair) if bev is None else bev, pair.frame, tags=tags)
 
 
 def registered_bev(pair: Pair) -> Bev:

@@ -1,7 +1,8 @@
 """Overviews of rasters whose bands must not be averaged: highest stays highest, lowest lowest, counts add up.
 
-GDAL builds overviews with one method for all bands of a file, and maximum, minimum and sum are not among
-its methods. It copies overviews that a virtual raster (VRT) names band by band, which is done here.
+The file is a cloud optimized GeoTIFF (OGC 21-026), as GDAL's driver COG arranges it. GDAL builds overviews
+with one method for all bands of a file, and maximum, minimum and sum are not among its methods. It copies
+overviews that a virtual raster (VRT) names band by band, which is done here.
 """
 
 from __future__ import annotations
@@ -22,6 +23,15 @@ Pool = Callable[[Image, Image], Image]
 HIGHEST: Pool = np.fmax
 LOWEST: Pool = np.fmin
 SUM: Pool = np.add
+
+
+def _mean(one: Image, other: Image) -> Image:
+    mean = np.float32(0.5) * (one + other)
+    return np.where(np.isfinite(mean), mean, np.where(np.isfinite(one), one, other))
+
+
+MEAN: Pool = _mean
+"""The mean of what is there; for differences, which are noise at some scale."""
 
 
 def halved(band: Image, pool: Pool) -> Image:
@@ -47,7 +57,7 @@ def halved(band: Image, pool: Pool) -> Image:
 def copy_with_overviews(
     source: str, path: Path, bands: Sequence[Image], pools: Sequence[Pool], levels: int, **creation: Any
 ) -> None:
-    """Copy a raster into a GeoTIFF with overviews at half, a quarter ... of its resolution.
+    """Copy a raster into a cloud optimized GeoTIFF with overviews at half, a quarter ... of its resolution.
 
     Args:
         source: the raster's name for GDAL; its values are those of `bands`.
@@ -55,7 +65,7 @@ def copy_with_overviews(
         bands: (h, w) float32 each.
         pools: how each band is reduced.
         levels: number of overviews.
-        creation: creation options of GDAL's GTiff driver.
+        creation: creation options of GDAL's COG driver.
 
     Raises:
         rasterio.errors.RasterioError: if the file cannot be written.
@@ -85,5 +95,6 @@ def copy_with_overviews(
                 overview = ElementTree.SubElement(band, "Overview")
                 ElementTree.SubElement(overview, "SourceFilename", relativeToVRT="0").text = name
                 ElementTree.SubElement(overview, "SourceBand").text = str(number)
+        given = "FORCE_USE_EXISTING" if names else "NONE"
         with MemoryFile(ElementTree.tostring(tree), ext=".vrt") as whole:
-            shutil.copy(whole.name, str(path), driver="GTiff", copy_src_overviews="YES", **creation)
+            shutil.copy(whole.name, str(path), driver="COG", overviews=given, **creation)

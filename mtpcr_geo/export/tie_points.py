@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +16,39 @@ from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.export import styles
 from mtpcr_geo.export.geopackage import Layer, write_geopackage
+from mtpcr_geo.export.raster_styles import qml
 
 Fields = dict[str, NDArray[Any]]
 
+ALIASES = {
+    "tie_point": "Tie point",
+    "plan_m": "Distance in plan (m)",
+    "residual_m": "Distance in space (m)",
+    "dx_m": "East, source minus target (m)",
+    "dy_m": "North, source minus target (m)",
+    "dz_m": "Height, source minus target (m)",
+    "score": "Score",
+    "inlier": "Agrees with the transform",
+    "held_out": "Held out from the solve",
+    "spacing_m": "Stands for others within (m)",
+    "source_x": "Source x, as in its file",
+    "source_y": "Source y, as in its file",
+    "source_z": "Source z, as in its file",
+    "role": "Cloud is",
+    "cloud": "File",
+    "points": "Points",
+    "rank": "Rank",
+    "yaw_deg": "Turned by (degrees)",
+    "shift_x_m": "Shift x, levelled frames (m)",
+    "shift_y_m": "Shift y, levelled frames (m)",
+    "overlap_cells": "Cells that both would fill",
+}
+"""What a GIS shows for each field of the layers."""
+
 _FOOTPRINT_POINTS = 40_000
+_PLACED_POINTS = 4_000
+_ARROW_SHARE = 0.02
+_ROUND = (1.0, 2.0, 5.0)
 
 
 def write_tie_points(path: str | Path, pair: Pair) -> None:
@@ -24,12 +56,16 @@ def write_tie_points(path: str | Path, pair: Pair) -> None:
 
     Layers, all in the CRS of the work frame (the target's; none for local clouds), coordinates absolute:
 
-    - ``tie_points``: 3D points at the target's end, with ``residual_m`` (and its parts ``dx_m``, ``dy_m``,
-      ``dz_m``: registered source minus target), ``score``, ``inlier``, ``held_out`` and the source's
-      coordinates as they stand in its file;
+    - ``tie_points``: 3D points at the target's end, with ``plan_m`` and ``residual_m``, the distance of both
+      ends in plan and in space (its parts ``dx_m``, ``dy_m``, ``dz_m``: registered source minus target),
+      ``score``, ``inlier``, ``held_out``, ``spacing_m``, the distance to the nearest tie point of a higher
+      score, by which they thin out on small maps, and the source's coordinates as they stand in its file;
     - ``links``: 3D lines from the registered source's end to the target's end of each tie point;
     - ``footprints``: convex outlines of the target and of the registered source;
-    - ``hypotheses``: where each candidate pose puts the middle of the source, with yaw and score.
+    - ``hypotheses``: the middle of what both clouds would share under each candidate pose, which is always
+      inside the target, with yaw and score.
+
+    Each has a style for QGIS, and names of its fields for people.
 
     Args:
         path: the GeoPackage to write; a layer for which there is nothing yet is left out.
@@ -39,14 +75,22 @@ def write_tie_points(path: str | Path, pair: Pair) -> None:
         OutputError: if the file cannot be written.
 
     """
-    layers = [_footprints(pair)]
+    limits = _limits(pair)
+    layers = []
     if pair.tie_points is not None and len(pair.tie_points.target):
-        layers.append(_tie_points(pair))
+        layers.append(_drawn(_tie_points(pair), styles.residual_style(limits)))
         if pair.T_target_source is not None:
-            layers.append(_links(pair))
+            layers.append(_drawn(_links(pair), styles.link_style(limits, _exaggeration(pair))))
     if pair.matches is not None and pair.matches.hypotheses:
-        layers.append(_hypotheses(pair))
+        layers.append(_drawn(_hypotheses(pair), styles.hypothesis_style()))
+    layers.append(_drawn(_footprints(pair), styles.footprint_style()))
     write_geopackage(path, layers, pair.frame.crs)
+
+
+def _drawn(layer: Layer, style: Sequence[Element]) -> Layer:
+    """Return a layer with a style and names for its fields."""
+    named = (*style, styles.aliases({name: ALIASES[name] for name in layer.fields}))
+    return replace(layer, style=qml(named).decode())
 
 
 def tie_positions(pair: Pair) -> tuple[Floats, Floats | None]:
@@ -108,6 +152,7 @@ def _tie_points(pair: Pair) -> Layer:
     surface_residual = np.full((len(target), 3), np.nan) if registered is None else registered - target
     fields: Fields = {
         "tie_point": np.arange(len(target), dtype=np.int32),
+        "plan_m": np.linalg.norm(surface_residual[:, :2], axis=1),
         "residual_m": np.linalg.norm(surface_residual, axis=1),
         "dx_m": surface_residual[:, 0],
         "dy_m": surface_residual[:, 1],
@@ -115,13 +160,14 @@ def _tie_points(pair: Pair) -> Layer:
         "score": np.asarray(tie_points.score, np.float64),
         "inlier": np.asarray(tie_points.inlier, bool),
         "held_out": np.asarray(tie_points.held_out, bool),
+        "spacing_m": _spacing(target[:, :2], np.asarray(tie_points.score, np.float64), tie_points.inlier),
         "source_x": source_file[:, 0],
         "source_y": source_file[:, 1],
         "source_z": source_file[:, 2],
     }
     about = "tie points at the target's end; residual: registered source minus target, metres"
     places = list((target + pair.frame.origin)[:, None, :])
-    return Layer("tie_points", "POINT", places, fields, about, styles.residual_style(_limits(pair)))
+    return Layer("tie_points", "POINT", places, fields, about)
 
 
 def _links(pair: Pair) -> Layer:
@@ -131,12 +177,13 @@ def _links(pair: Pair) -> Layer:
     lines = list(np.stack([registered, target], axis=1) + pair.frame.origin)
     fields: Fields = {
         "tie_point": np.arange(len(target), dtype=np.int32),
+        "plan_m": np.linalg.norm((registered - target)[:, :2], axis=1),
         "residual_m": np.linalg.norm(registered - target, axis=1),
         "inlier": np.asarray(pair.tie_points.inlier, bool),
         "held_out": np.asarray(pair.tie_points.held_out, bool),
     }
     about = "from each tie point's registered source end to its target end"
-    return Layer("links", "LINESTRING", lines, fields, about, styles.link_style(_limits(pair)))
+    return Layer("links", "LINESTRING", lines, fields, about)
 
 
 def _footprints(pair: Pair) -> Layer:
@@ -149,19 +196,19 @@ def _footprints(pair: Pair) -> Layer:
     }
     shapes = [ring + pair.frame.origin[:2] for ring in rings.values()]
     about = "convex outlines of the target and of the source as the transform places it"
-    return Layer("footprints", "POLYGON", shapes, fields, about, styles.footprint_style())
+    return Layer("footprints", "POLYGON", shapes, fields, about)
 
 
 def _hypotheses(pair: Pair) -> Layer:
     assert pair.matches is not None
     every = pair.matches.hypotheses
-    corners = np.stack([pair.source.sample.min(axis=0), pair.source.sample.max(axis=0)])
-    middle = transforms.apply(pair.source.T_level_work, corners.mean(axis=0, keepdims=True))[0]
+    step = max(1, len(pair.source.sample) // _PLACED_POINTS)
+    some = transforms.apply(pair.source.T_level_work, pair.source.sample[::step])[:, :2]
     T_work_levelled = transforms.inverse(pair.target.T_level_work)
     height = float(np.median(pair.target.sample[:: max(1, len(pair.target.sample) // 10_000), 2]))
     places = []
     for one in every:
-        plan = transforms.yaw_matrix(one.yaw)[:2, :2] @ middle[:2] + np.asarray(one.shift)
+        plan = _shared_middle(pair, some @ transforms.yaw_matrix(one.yaw)[:2, :2].T + np.asarray(one.shift))
         work = transforms.apply(T_work_levelled, np.array([[plan[0], plan[1], height]]))
         places.append(work + pair.frame.origin)
     fields: Fields = {
@@ -172,16 +219,70 @@ def _hypotheses(pair: Pair) -> Layer:
         "shift_y_m": np.array([one.shift[1] for one in every], np.float64),
         "overlap_cells": np.array([one.overlap_cells for one in every], np.int64),
     }
-    about = "where each candidate pose puts the middle of the source; rank 1 was followed"
+    about = "the middle of what both would share under each candidate pose; rank 1 was followed"
     return Layer("hypotheses", "POINT", places, fields, about)
+
+
+def _shared_middle(pair: Pair, plan: Floats) -> Floats:
+    """Return the middle of those of (n, 2) levelled target coordinates that the target covers, metres.
+
+    A pose may put the middle of a long source far from all that is drawn; what it would share is not.
+    """
+    low, high = transforms.bounds(pair.target.levelled_sample)
+    bev = pair.target.bev
+    if bev is None:
+        inside = np.all((plan >= low[:2]) & (plan <= high[:2]), axis=1)
+    else:
+        column, row = bev.grid.cells(plan)
+        inside = bev.grid.holds(column, row)
+        inside[inside] = bev.count[row[inside], column[inside]] > 0
+    middle = (plan[inside] if inside.any() else plan).mean(axis=0)
+    return np.asarray(np.clip(middle, low[:2], high[:2]))
+
+
+def _spacing(plan: Floats, score: Floats, agrees: NDArray[np.bool_]) -> Floats:
+    """Return how far each of (n, 2) points is from the nearest one of a higher score that is of its kind.
+
+    Those that agree and those that do not are thinned apart, so that neither hides the other.
+
+    Returns:
+        (n,) metres; the best of each kind has the extent of all.
+
+    """
+    extent = float(np.hypot(*np.ptp(plan, axis=0))) + 1.0
+    spacing = np.full(len(plan), extent)
+    for kind in (True, False):
+        order = np.flatnonzero(np.asarray(agrees, bool) == kind)
+        order = order[np.argsort(-score[order], kind="stable")]
+        for place in range(1, len(order)):
+            apart = plan[order[:place]] - plan[order[place]]
+            spacing[order[place]] = np.sqrt((apart**2).sum(axis=1).min())
+    return spacing
+
+
+def _exaggeration(pair: Pair) -> float:
+    """Return the round factor, at least 1, by which arrows of the plan residuals become readable."""
+    target, registered = tie_positions(pair)
+    assert registered is not None
+    assert pair.tie_points is not None
+    agrees = np.asarray(pair.tie_points.inlier, bool)
+    if not agrees.any():
+        return 1.0
+    typical = float(np.median(np.linalg.norm((registered - target)[agrees, :2], axis=1)))
+    wanted = _ARROW_SHARE * float(np.hypot(*np.ptp(target[agrees, :2], axis=0))) / max(typical, 1e-6)
+    exponent = np.floor(np.log10(max(wanted, 1.0)))
+    round_ones = [step * 10.0**exponent for step in _ROUND]
+    return float(min(max((one for one in round_ones if one <= wanted), default=1.0), 1000.0))
 
 
 def _limits(pair: Pair) -> tuple[float, float]:
     """Return where green ends and red begins, from the inliers' own spread, rounded to centimetres."""
-    target, registered = tie_positions(pair)
-    assert pair.tie_points is not None
-    if registered is None or not pair.tie_points.inlier.any():
+    if pair.tie_points is None or not pair.tie_points.inlier.any():
         return 0.1, 0.5
-    spread = float(np.median(np.linalg.norm(registered - target, axis=1)[pair.tie_points.inlier]))
+    target, registered = tie_positions(pair)
+    if registered is None:
+        return 0.1, 0.5
+    apart = np.linalg.norm((registered - target)[:, :2], axis=1)
+    spread = float(np.median(apart[pair.tie_points.inlier]))
     low = max(round(2.0 * spread, 2), 0.02)
     return low, round(3.0 * low, 2)

@@ -164,6 +164,11 @@ class OutputSet:
         """Return what has been written so far and waits to be put in place, in order."""
         return [final for final, part in self._parts.items() if part.exists()]
 
+    def part_of(self, final: Path) -> Path | None:
+        """Return where a file lies until it is put in place; None if it has not been written."""
+        part = self._parts.get(final)
+        return part if part is not None and part.exists() else None
+
     def commit(self) -> list[Path]:
         """Put everything in place; return what was written, in order.
 

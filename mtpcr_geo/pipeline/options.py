@@ -412,6 +412,7 @@ def _short(value: Any) -> str:
 OUTPUT_NAMES = {
     "bev": Path("bev") / "#.tif",
     "tie_points": Path("ties.gpkg"),
+    "project": Path("project.qgz"),
     "transform": Path("transform.json"),
     "matrix": Path("transform.cloudcompare.txt"),
     "pdal": Path("transform.pdal.json"),

@@ -43,6 +43,8 @@ def test_register_brings_the_source_home_and_leaves_everything(registered):
     names = {str(path.relative_to(out)) for path in files_below(out)}
     assert names == {
         "bev/source.tif", "bev/target.tif", "bev/registered.tif", "ties.gpkg", "transform.json",
+        "bev/source.qml", "bev/target.qml", "bev/registered.qml", "bev/difference.tif", "bev/difference.qml",
+        "bev/source.tif.points", "project.qgz",
         "transform.cloudcompare.txt",
         "transform.pdal.json", "audit.rrd", "report.html", "run.json", "registered.laz",
     }  # fmt: skip

@@ -24,6 +24,10 @@ FAR, NEAR = Rival(41.0, 0.0, 0.0, 1.1, True), Rival(1.0, 0.0, 0.0, 1.1, False)
 REFUSED = {
     "registered.laz",
     "registered.tif",
+    "registered.qml",
+    "difference.tif",
+    "difference.qml",
+    "source.tif.points",
     "transform.json",
     "transform.cloudcompare.txt",
     "transform.pdal.json",

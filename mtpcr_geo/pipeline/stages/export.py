@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -14,12 +15,20 @@ from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.recorder import NullRecorder
 from mtpcr_geo.core.system import peak_memory_mb
 from mtpcr_geo.core.types import Pair, Side, Verdict
+from mtpcr_geo.core.wording import visible
 from mtpcr_geo.crs.chain import TransformChain
-from mtpcr_geo.pipeline.options import Force
+from mtpcr_geo.pipeline.options import OUTPUT_NAMES, Force
 from mtpcr_geo.pipeline.records import Written
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
+    from mtpcr_geo.export.qgis.layers import LayerFile
+
 TransformFormat = Literal["json", "cloudcompare", "pdal"]
+DERIVED_ROLES = ("registered", "difference", "target_upright")
+"""Rasters that are made once the pair is solved, by what replaces the # in their names."""
 
 
 class ApplyOptions(StageOptions):
@@ -97,14 +106,15 @@ class BevFileOptions(FileOptions):
     """Options of mtpcr.write_bev."""
 
     filename: Path = Field(
-        description="file to write; a # in it stands for 'source', 'target' and, once the pair is "
-        "solved, 'registered': the source's raster laid over the target's"
+        description="file to write; a # in it stands for 'source', 'target' and, once the pair is solved, "
+        "'registered' (the source's raster laid over the target's), 'difference' (of both) and, where the "
+        "target was levelled, 'target_upright'; beside each raster a .qml, by which QGIS draws it"
     )
     force: Force = False
 
 
 class WriteBev(EvidenceWriter):
-    """Write the height rasters as GeoTIFF."""
+    """Write the height rasters as GeoTIFF, with styles for QGIS."""
 
     type: ClassVar[str] = "mtpcr.write_bev"
     needs: ClassVar[tuple[str, ...]] = ("rasterio", "mtpcr_geo.export.geotiff")
@@ -113,10 +123,11 @@ class WriteBev(EvidenceWriter):
     options: BevFileOptions
 
     def writes(self) -> list[Path]:
-        """Name both files, or the one."""
-        if "#" not in self.options.filename.name:
-            return [self.options.filename]
-        return [self._file(role) for role in ("source", "target", "registered")]
+        """Name the rasters, or the one, their styles, and the points for the Georeferencer."""
+        if not self._for_roles:
+            return [self.options.filename, self.options.filename.with_suffix(".qml")]
+        rasters = [self._file(role) for role in ("source", "target", *DERIVED_ROLES)]
+        return [*rasters, *(path.with_suffix(".qml") for path in rasters), self._points]
 
     def missing(self, pair: Pair, context: RunContext) -> str | None:
         """Need a raster."""
@@ -124,26 +135,84 @@ class WriteBev(EvidenceWriter):
 
     def write(self, pair: Pair, context: RunContext) -> None:
         """Write a GeoTIFF for each side that has a raster."""
-        from mtpcr_geo.export.geotiff import write_registered_bev, write_side_bev
+        from mtpcr_geo.export.geotiff import write_side_bev
+        from mtpcr_geo.export.raster_styles import height_limits, relief_style
 
         sides = [side for side in self._sides(pair) if side.bev is not None]
-        if len(sides) > 1 and "#" not in self.options.filename.name:
+        if len(sides) > 1 and not self._for_roles:
             raise OptionError(
                 f"{self.label}: two rasters are two files; write a # in the filename for the roles"
             )
         for side in sides:
-            write_side_bev(context.outputs.path(self._file(side.role)), side, pair.frame)
-        if "#" not in self.options.filename.name:
+            assert side.bev is not None
+            file = self._file(side.role)
+            write_side_bev(context.outputs.path(file), side, pair.frame)
+            low, high = height_limits([side.bev.top])
+            self._style(context, file, relief_style(low + side.link.origin[2], high + side.link.origin[2]))
+        if not self._for_roles:
             return
-        file = self._file("registered")
+        files = [self._file(role) for role in DERIVED_ROLES[:2]]
+        files = [*files, *(file.with_suffix(".qml") for file in files), self._points]
         withheld = pair.verdict.withholds_transform if pair.verdict is not None else None
         if len(sides) < 2 or pair.T_target_source is None:
-            self.not_written[file] = "no transform was found"
+            self.not_written |= dict.fromkeys(files, "no transform was found")
         elif withheld is not None and not self.options.force:
-            self.not_written[file] = withheld
+            self.not_written |= dict.fromkeys(files, withheld)
         else:
             self.forced = withheld is not None
-            write_registered_bev(context.outputs.path(file), pair)
+            self._write_solved(pair, context)
+
+    def _write_solved(self, pair: Pair, context: RunContext) -> None:
+        """Write what there is once a transform is found: heights of both with the same colours."""
+        from mtpcr_geo.export.difference import height_difference, upright_target, write_difference
+        from mtpcr_geo.export.georeferencer import write_points
+        from mtpcr_geo.export.geotiff import registered_bev, write_bev, write_registered_bev
+        from mtpcr_geo.export.raster_styles import (
+            difference_limit,
+            difference_style,
+            height_limits,
+            relief_style,
+        )
+
+        registered, difference_file, upright_file = (self._file(role) for role in DERIVED_ROLES)
+        upright = upright_target(pair)
+        z = float(pair.frame.origin[2])
+        moved = registered_bev(pair)
+        low, high = height_limits([upright.top, moved.top])
+        write_registered_bev(context.outputs.path(registered), pair, moved)
+        self._style(context, registered, relief_style(low + z, high + z))
+        if upright is not pair.target.bev:
+            tags = {"ROLE": "target, upright", "CLOUD": Path(pair.target.cloud.name).name}
+            write_bev(context.outputs.path(upright_file), upright, pair.frame, tags=tags)
+            self._style(context, upright_file, relief_style(low + z, high + z))
+        difference = height_difference(pair)
+        if difference is None:
+            why = "the clouds share no cell"
+            styled = difference_file.with_suffix(".qml")
+            self.not_written |= {difference_file: why, styled: why}
+        else:
+            write_difference(context.outputs.path(difference_file), difference, pair)
+            self._style(context, difference_file, difference_style(difference_limit(difference.low)))
+        if pair.tie_points is None:
+            self.not_written[self._points] = "no tie points were found"
+        else:
+            write_points(context.outputs.path(self._points), pair)
+
+    @staticmethod
+    def _style(context: RunContext, file: Path, style: list[Element]) -> None:
+        from mtpcr_geo.export.raster_styles import write_qml
+
+        write_qml(context.outputs.path(file.with_suffix(".qml")), style)
+
+    @property
+    def _for_roles(self) -> bool:
+        return "#" in self.options.filename.name
+
+    @property
+    def _points(self) -> Path:
+        """The file that QGIS's Georeferencer reads when it opens the source's raster."""
+        file = self._file("source")
+        return file.with_name(f"{file.name}.points")
 
     def _file(self, role: str) -> Path:
         return self.options.filename.with_name(self.options.filename.name.replace("#", role))
@@ -168,6 +237,61 @@ class WriteTiePoints(EvidenceWriter):
         from mtpcr_geo.export.tie_points import write_tie_points
 
         write_tie_points(context.outputs.path(self.options.filename), pair)
+
+
+class ProjectFileOptions(FileOptions):
+    """Options of mtpcr.write_project."""
+
+    filename: Path = Field(description="QGIS project to write, .qgz")
+    rasters: Path | None = Field(
+        None,
+        description="the files of mtpcr.write_bev, with their #; bev/#.tif beside the project if not given",
+    )
+    tie_points: Path | None = Field(
+        None,
+        description="the file of mtpcr.write_tie_points; ties.gpkg beside the project if not given",
+    )
+
+
+class WriteProject(EvidenceWriter):
+    """Write a QGIS project of the rasters and tie points that the run leaves, whatever this stage's place."""
+
+    type = "mtpcr.write_project"
+    late = True
+    Options: ClassVar[OptionsModel] = ProjectFileOptions
+    options: ProjectFileOptions
+
+    def write(self, pair: Pair, context: RunContext) -> None:
+        """Write the project, or say that there is nothing to show."""
+        from mtpcr_geo.export.qgis.project import About, write_project
+
+        folder = self.options.filename.parent
+        named = self.options.rasters or folder / OUTPUT_NAMES["bev"]
+        roles = ("source", "target", *DERIVED_ROLES) if "#" in named.name else ("target",)
+        rasters = {
+            role: self._file(named.with_name(named.name.replace("#", role)), context) for role in roles
+        }
+        ties = self._file(self.options.tie_points or folder / OUTPUT_NAMES["tie_points"], context)
+        found = {role: file for role, file in rasters.items() if file is not None}
+        if not found and ties is None:
+            self._skip("the run leaves neither rasters nor tie points")
+            return
+        sentence = pair.verdict.headline if pair.verdict is not None else "The pair was not judged."
+        about = About(Path(pair.source.cloud.name).name, Path(pair.target.cloud.name).name, sentence)
+        write_project(context.outputs.path(self.options.filename), found, ties, about)
+
+    def _file(self, final: Path, context: RunContext) -> LayerFile | None:
+        from mtpcr_geo.export.qgis.layers import LayerFile
+
+        part = context.outputs.part_of(final)
+        if part is None:
+            return None
+        try:
+            where = Path(os.path.relpath(final, self.options.filename.parent)).as_posix()
+        except ValueError:  # another drive
+            where = final.resolve().as_posix()
+        here = "" if where.startswith("..") or Path(where).is_absolute() else "./"
+        return LayerFile(visible(here + where), part)
 
 
 class TransformFileOptions(FileOptions):

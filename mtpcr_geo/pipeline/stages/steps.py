@@ -25,8 +25,10 @@ from mtpcr_geo.pipeline.stages.export import (
     ApplyOptions,
     BevFileOptions,
     FileOptions,
+    ProjectFileOptions,
     TransformFileOptions,
     WriteBev,
+    WriteProject,
     WriteRecording,
     WriteReport,
     WriteRun,
@@ -288,6 +290,7 @@ def writers_of(
         stages.append(SavedRecording(recording, where["recording"], "recording"))
     return [
         *stages,
+        WriteProject(ProjectFileOptions(filename=where["project"]), "project"),
         WriteReport(FileOptions(filename=where["report"]), "report"),
         WriteRun(FileOptions(filename=where["run"]), "run"),
         Apply(ApplyOptions(force=force), "moved"),
