@@ -51,8 +51,9 @@ def visible(text: str) -> str:
     right-to-left marks, and half a character (of a file name that is no text) cannot be written at all. Every
     text for a person goes through this on its way out.
     """
-    if text.isprintable():
-        return text
-    return "".join(
-        letter if letter.isprintable() or letter == "\n" else repr(letter)[1:-1] for letter in text
-    )
+    # a page is long, and nearly all of its lines have nothing to be escaped
+    return "\n".join(line if line.isprintable() else _escaped(line) for line in text.split("\n"))
+
+
+def _escaped(line: str) -> str:
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in line)
