@@ -151,7 +151,7 @@ def _transform_rows(result: Registration) -> list[tuple[str, str]]:
 
     R = pair.T_target_source[:3, :3]
     yaw = transforms.yaw_of(R)
-    tilt = math.degrees(transforms.rotation_angle(transforms.yaw_matrix(yaw).T @ R))
+    tilt = math.degrees(transforms.tilt_of(R))
     rows = [("yaw", f"{math.degrees(yaw):+.3f} degrees, tilt {tilt:.3f}")]
     shift = shift_text(pair)
     if shift:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import shlex
 import sys
 import time
 from collections.abc import Iterator
@@ -30,6 +31,19 @@ def versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             continue
     return found
+
+
+def command_line() -> str | None:
+    """Return the command line that started this process, as a shell takes it; None where another program did.
+
+    The command's folder is left out: it says where the package is installed and not what was run.
+    """
+    started = Path(sys.argv[0]) if sys.argv else Path()
+    if started.name == "__main__.py" and started.parent.name == "mtpcr_geo":
+        return shlex.join(["python", "-m", "mtpcr_geo", *sys.argv[1:]])
+    if started.stem != "mtpcr-geo":
+        return None
+    return shlex.join(["mtpcr-geo", *sys.argv[1:]])
 
 
 def sha256(path: str | Path) -> str:

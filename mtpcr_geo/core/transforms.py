@@ -104,6 +104,11 @@ def yaw_of(R: Matrix) -> float:
     return float(np.arctan2(R[1, 0], R[0, 0]))
 
 
+def tilt_of(R: Matrix) -> float:
+    """Tilt of a (3, 3) rotation in radians: the angle by which it turns the vertical."""
+    return float(np.arctan2(np.hypot(R[0, 2], R[1, 2]), R[2, 2]))
+
+
 def orthonormal(R: Matrix) -> Matrix:
     """Nearest proper rotation to a (3, 3) matrix, in the Frobenius sense."""
     U, _, Vt = np.linalg.svd(R)

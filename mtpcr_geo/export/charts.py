@@ -1,9 +1,9 @@
-"""Small charts as inline SVG, for a report that needs no other file."""
+"""Small charts as inline SVG without texts of their own: a page sets labels beside them, at its own size."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,136 +11,160 @@ from numpy.typing import NDArray
 from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.export import drawing
 
-_WIDTH = 640
+_MAP_SIDE = 1000.0
 
 
-def bars(values: Sequence[float], labels: Sequence[str], notes: Sequence[str] = ()) -> str:
-    """Return horizontal bars, the first one highlighted.
+@dataclass(frozen=True)
+class Chart:
+    """A chart and what a page sets around it.
 
-    Args:
-        values: lengths, none negative.
-        labels: what stands before each bar.
-        notes: what stands after each bar; the value if not given.
-
-    """
-    top = max([*values, 1e-12])
-    row, left, right = 24, 190, 110
-    parts = []
-    for i, (value, label) in enumerate(zip(values, labels, strict=True)):
-        y = i * row
-        length = max(1.0, (_WIDTH - left - right) * max(value, 0.0) / top)
-        note = notes[i] if notes else f"{value:.3g}"
-        fill = "var(--main)" if i == 0 else "var(--quiet)"
-        parts.append(
-            f'<text x="{left - 8}" y="{y + 16}" text-anchor="end">{escape(label)}</text>'
-            f'<rect x="{left}" y="{y + 4}" width="{length:.1f}" height="{row - 8}" rx="2" fill="{fill}"/>'
-            f'<text x="{left + length + 6:.1f}" y="{y + 16}">{escape(note)}</text>'
-        )
-    return _svg(_WIDTH, max(len(values), 1) * row, parts)
-
-
-def histogram(residual_m: Floats, inlier: Mask, limit_m: float, bins: int = 32) -> str:
-    """Return a histogram of the residuals of tie points: agreeing ones green, the others red, stacked.
-
-    Args:
-        residual_m: (n,) residuals in metres.
-        inlier: (n,) which agree with the transform.
-        limit_m: where the axis ends; larger residuals are counted in the last bar.
+    Attributes:
+        svg: the drawing, which holds nothing but numbers and colours of this module.
+        aspect: its height over its width, where it keeps that.
+        low, high: values at the ends of its x axis.
+        top: value at the top of its y axis.
 
     """
-    height, base, left = 190, 160, 36
-    clipped = np.clip(residual_m, 0.0, limit_m)
-    good, _ = np.histogram(clipped[inlier], bins=bins, range=(0.0, limit_m))
-    bad, _ = np.histogram(clipped[~inlier], bins=bins, range=(0.0, limit_m))
-    top = max(int((good + bad).max()), 1)
-    step = (_WIDTH - left - 10) / bins
-    parts = []
-    for i, (g, b) in enumerate(zip(good, bad, strict=True)):
-        y = float(base)
-        for number, colour in ((g, drawing.GOOD_RGB), (b, drawing.BAD_RGB)):
-            size = (base - 12) * float(number) / top
-            y -= size
+
+    svg: str
+    aspect: float = 0.0
+    low: float = 0.0
+    high: float = 0.0
+    top: float = 0.0
+
+
+def histogram(
+    values: Floats, parts: Sequence[tuple[Mask, str]], low: float, high: float, what: str, bins: int = 32
+) -> Chart:
+    """Return a histogram, its parts stacked; it fills whatever box it is put in.
+
+    Args:
+        values: (n,).
+        parts: masks (n,) of the values and their CSS colours, from the bottom up.
+        low, high: ends of the axis; values beyond are counted in the first and the last bar.
+        what: the values are, for the count that a pointer shows.
+        bins: number of bars.
+
+    """
+    clipped = np.clip(values, low, high)
+    counts = [np.histogram(clipped[mask], bins=bins, range=(low, high))[0] for mask, _ in parts]
+    top = max(int(np.sum(counts, axis=0).max()), 1) if counts else 1
+    step = 100.0 / bins
+    drawn = []
+    base = np.full(bins, 100.0)
+    for count, (_, colour) in zip(counts, parts, strict=True):
+        for i, number in enumerate(count):
             if number:
-                parts.append(
-                    f'<rect x="{left + i * step + 1:.1f}" y="{y:.1f}" width="{step - 2:.1f}" '
-                    f'height="{size:.1f}" fill="{_css(colour)}">'
-                    f"<title>{int(number)} tie points</title></rect>"
+                size = 100.0 * float(number) / top
+                base[i] -= size
+                drawn.append(
+                    f'<rect x="{i * step + 0.15:.2f}" y="{base[i]:.2f}" width="{step - 0.3:.2f}" '
+                    f'height="{size:.2f}" fill="{colour}"><title>{int(number)} {what}</title></rect>'
                 )
-    parts.append(f'<line x1="{left}" y1="{base}" x2="{_WIDTH - 10}" y2="{base}" stroke="currentColor"/>')
-    parts.append(f'<text x="{left - 6}" y="20" text-anchor="end">{top}</text>')
-    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
-        x = left + share * (_WIDTH - left - 10)
-        sign = "≥ " if share == 1.0 else ""
-        anchor = "end" if share == 1.0 else "middle"
-        text = f"{sign}{share * limit_m:.2g} m"
-        parts.append(f'<text x="{x:.1f}" y="{base + 18}" text-anchor="{anchor}">{text}</text>')
-    return _svg(_WIDTH, height, parts)
+    svg = (
+        '<svg viewBox="0 0 100 100" preserveAspectRatio="none" aria-hidden="true" focusable="false">'
+        f"{''.join(drawn)}</svg>"
+    )
+    return Chart(svg, 0.0, low, high, float(top))
+
+
+@dataclass(frozen=True)
+class ResidualMap:
+    """A map of tie points.
+
+    Attributes:
+        chart: the drawing.
+        bar_m: length of a scale bar, metres.
+        bar: the same in percent of the width.
+        enlarged: times that arrows are longer than what they stand for; 0 where there are none.
+        shortened: arrows that are drawn shorter than that, since they would cover the map.
+
+    """
+
+    chart: Chart
+    bar_m: float
+    bar: float
+    enlarged: float
+    shortened: int
 
 
 def residual_map(
-    target: Floats, registered: Floats, colours: NDArray[np.uint8], rings: dict[str, Floats]
-) -> str:
-    """Return tie points in plan, coloured by residual, with the residual itself as a line, enlarged.
+    target: Floats,
+    residual: Floats | None,
+    colours: NDArray[np.uint8],
+    rings: dict[str, Floats],
+    of: Mask | None = None,
+) -> ResidualMap:
+    """Return tie points in plan, coloured, with their residuals as arrows, enlarged.
 
     Args:
         target: (n, 3) target ends in metres.
-        registered: (n, 3) registered source ends in metres.
+        residual: (n, 2) registered source minus target in plan, metres; None for no arrows.
         colours: (n, 3) uint8.
         rings: outlines by role, (m, 2) metres.
+        of: (n,) the tie points whose median sets the length of the arrows; all if None.
 
     """
-    every = np.vstack([target[:, :2], *rings.values()])
-    low, high = every.min(axis=0), every.max(axis=0)
-    size = float(max(high - low)) or 1.0
-    scale = (_WIDTH - 20) / max(float(high[0] - low[0]), size * 0.5, 1e-6)
-    height = float(high[1] - low[1]) * scale + 44
-    offset = 10 + (_WIDTH - 20 - float(high[0] - low[0]) * scale) / 2
+    # outlines are cut where they leave the tie points
+    low, high = target[:, :2].min(axis=0), target[:, :2].max(axis=0)
+    extent = np.maximum(high - low, 1e-6)
+    size = float(max(extent))
+    low, high = low - 0.14 * size, high + 0.14 * size
+    extent = high - low
+    # a strip is shown on a map no narrower than half its length
+    pad = np.maximum(0.5 * float(extent.max()) - extent, 0.0) / 2
+    low, high = low - pad, high + pad
+    extent = high - low
+    scale = _MAP_SIDE / float(extent[0])
+    height = float(extent[1]) * scale
 
     def place(plan: Floats) -> Floats:
-        x = offset + (plan[:, 0] - low[0]) * scale
-        return np.column_stack([x, 10 + (high[1] - plan[:, 1]) * scale])
+        return np.column_stack([(plan[:, 0] - low[0]) * scale, (high[1] - plan[:, 1]) * scale])
 
-    parts = []
+    drawn = []
     for role, ring in rings.items():
         colour = drawing.SOURCE_RGB if role == "source" else drawing.TARGET_RGB
-        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in place(ring))
-        parts.append(f'<polyline points="{points}" fill="none" stroke="{_css(colour)}" stroke-width="1.5"/>')
-    surface_residual = registered[:, :2] - target[:, :2]
-    length = np.linalg.norm(surface_residual, axis=1)
-    enlarge = _round_number(0.04 * size / max(float(np.median(length)), 1e-4))
-    # a few wild tie points must not cover the map with lines
-    drawn = (
-        surface_residual
-        * np.minimum(1.0, 0.12 * size / np.maximum(length * enlarge, 1e-9))[:, None]
-        * enlarge
-    )
-    ends = place(target[:, :2] + drawn)
-    for (x, y), (u, v), colour in zip(place(target[:, :2]), ends, colours, strict=True):
-        parts.append(
-            f'<path d="M{x:.1f} {y:.1f}L{u:.1f} {v:.1f}" stroke="{_css(colour)}"/>'
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.5" fill="{_css(colour)}"/>'
+        points = " ".join(f"{x:.0f},{y:.0f}" for x, y in place(ring))
+        drawn.append(
+            f'<polyline points="{points}" fill="none" stroke="{_css(colour)}" stroke-width="1.5" '
+            'vector-effect="non-scaling-stroke"/>'
         )
-    bar = _round_number(size / 5)
-    y = height - 22
-    parts.append(
-        f'<path d="M10 {y:.0f}h{bar * scale:.1f}" stroke="currentColor" stroke-width="2"/>'
-        f'<text x="10" y="{y + 17:.0f}">{bar:g} m; residuals drawn {enlarge:g} times their length</text>'
+    enlarged, shortened = 0.0, 0
+    xy = place(target[:, :2])
+    # of a strip or a plot all stay apart
+    dot = float(np.clip(160.0 / np.sqrt(max(len(target), 1)), 4.0, 9.0))
+    if residual is not None and len(residual):
+        length = np.linalg.norm(residual, axis=1)
+        typical = length if of is None or not of.any() else length[of]
+        enlarged = drawing.round_number(0.035 * size / max(float(np.median(typical)), 1e-4))
+        longest = 0.12 * size
+        cut = np.minimum(1.0, longest / np.maximum(length * enlarged, 1e-9))
+        shortened = int((cut < 1.0).sum())
+        ends = place(target[:, :2] + residual * cut[:, None] * enlarged)
+        for (x, y), (u, v), colour in zip(xy, ends, colours, strict=True):
+            drawn.append(_arrow(x, y, u, v, _css(colour), dot))
+    for (x, y), colour in zip(xy, colours, strict=True):
+        drawn.append(f'<circle cx="{x:.0f}" cy="{y:.0f}" r="{dot:.1f}" fill="{_css(colour)}"/>')
+    svg = (
+        f'<svg viewBox="0 0 {_MAP_SIDE:.0f} {height:.0f}" aria-hidden="true" focusable="false">'
+        f"{''.join(drawn)}</svg>"
     )
-    return _svg(_WIDTH, height, parts)
+    bar = drawing.round_number(float(extent[0]) * 0.3)
+    return ResidualMap(
+        Chart(svg, height / _MAP_SIDE), bar, 100.0 * bar / float(extent[0]), enlarged, shortened
+    )
 
 
-def _svg(width: float, height: float, parts: Sequence[str]) -> str:
-    return (
-        f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" fill="currentColor" '
-        f'font-size="12">{"".join(parts)}</svg>'
-    )
+def _arrow(x: float, y: float, u: float, v: float, colour: str, dot: float) -> str:
+    """Return an arrow from a tie point's target end to where the source's end lies, enlarged."""
+    length = float(np.hypot(u - x, v - y))
+    line = f'<path d="M{x:.0f} {y:.0f}L{u:.0f} {v:.0f}'
+    if length > 2.5 * dot:
+        dx, dy = (u - x) / length * 1.6 * dot, (v - y) / length * 1.6 * dot
+        line += f"M{u - dx - 0.5 * dy:.0f} {v - dy + 0.5 * dx:.0f}L{u:.0f} {v:.0f}"
+        line += f"L{u - dx + 0.5 * dy:.0f} {v - dy - 0.5 * dx:.0f}"
+    return f'{line}" fill="none" stroke="{colour}" stroke-width="1.5" vector-effect="non-scaling-stroke"/>'
 
 
 def _css(colour: Sequence[int] | NDArray[np.uint8]) -> str:
     return "#" + "".join(f"{int(part):02x}" for part in colour)
-
-
-def _round_number(value: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is not above a positive number."""
-    power = 10.0 ** np.floor(np.log10(max(value, 1e-9)))
-    return float(max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-9)) * power)

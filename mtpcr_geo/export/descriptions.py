@@ -152,7 +152,7 @@ def transform_rows(pair: Pair) -> list[Row]:
         return []
     R = pair.T_target_source[:3, :3]
     yaw = transforms.yaw_of(R)
-    tilt = math.degrees(transforms.rotation_angle(transforms.yaw_matrix(yaw).T @ R))
+    tilt = math.degrees(transforms.tilt_of(R))
     rows = [("yaw", f"{math.degrees(yaw):+.4f}° (counter-clockwise from above)"), ("tilt", f"{tilt:.4f}°")]
     moved = shift_text(pair)
     if moved:
@@ -238,7 +238,7 @@ def registration_rows(pair: Pair | None, verdict: Verdict) -> list[Row]:
         if pair.T_target_source is not None:
             R = pair.T_target_source[:3, :3]
             yaw = transforms.yaw_of(R)
-            tilt = math.degrees(transforms.rotation_angle(transforms.yaw_matrix(yaw).T @ R))
+            tilt = math.degrees(transforms.tilt_of(R))
             shift = shift_text(pair)
             text = f"yaw {math.degrees(yaw):+.3f}°, tilt {tilt:.3f}°"
             rows.append(("transform", f"{text}, the centroid moves by {shift}" if shift else text))

@@ -307,6 +307,12 @@ def fit(picture: Picture, max_side: int) -> Picture:
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
+def round_number(value: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is not above a positive number."""
+    power = 10.0 ** np.floor(np.log10(max(value, 1e-9)))
+    return float(max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-9)) * power)
+
+
 def png(picture: Picture) -> bytes:
     """Return as encoded bytes a (h, w) or (h, w, 3) RGB picture as PNG."""
     return _encode(picture, ".png", [16, 3])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -13,10 +14,11 @@ import pytest
 from helpers_scene import ICP_RESULT, make_pair, rasterise
 
 from mtpcr_geo.core.errors import OutputError
-from mtpcr_geo.core.types import Verdict
+from mtpcr_geo.core.types import Check, Verdict
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.export import charts, descriptions, drawing
 from mtpcr_geo.export.report.page import write_report
+from mtpcr_geo.export.report.shown import ticks
 
 DONE = [
     {"type": "mtpcr.level", "tag": "level", "options": {"method": "auto"}, "seconds": 0.5, "metadata": {}},
@@ -41,11 +43,15 @@ class Links(HTMLParser):
     def __init__(self) -> None:
         super().__init__()
         self.open: list[str] = []
+        self.scripts = 0
         self.fetched: list[str] = []
 
     def handle_starttag(self, tag, attrs):
+        self.scripts += tag == "script"
+        # nothing of a page runs by itself, whatever stands in its texts
+        assert not any(name.startswith("on") for name, _ in attrs)
         self.fetched += [value for name, value in attrs if name in {"src", "href"}]
-        if tag not in {"meta", "img", "br"}:
+        if tag not in {"meta", "img", "br", "link", "input"}:
             self.open.append(tag)
 
     def handle_startendtag(self, tag, attrs):
@@ -67,14 +73,22 @@ def test_one_whole_file_without_a_network(tmp_path, verdict):
     parser = Links()
     parser.feed(html)
     assert parser.open == []
-    assert len(parser.fetched) == 5
-    assert all(source.startswith("data:image/jpeg;base64,") for source in parser.fetched)
+    assert parser.fetched.pop(0) == "data:,"  # no icon is asked for
+    assert len(parser.fetched) == 10
+    assert all(re.match("data:image/(webp|png);base64,", source) for source in parser.fetched)
     for source in parser.fetched:
-        picture = cv2.imdecode(np.frombuffer(base64.b64decode(source.split(",")[1]), np.uint8), 1)
+        picture = cv2.imdecode(np.frombuffer(base64.b64decode(source.split(",")[1]), np.uint8), -1)
         assert picture is not None
         assert picture.std() > 5.0
+    assert len(html) < 3e6
     assert f'class="verdict {verdict}"' in html
-    assert "http" not in html
+    assert not re.search("https?:", html)
+    assert "url(" not in html
+    (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', html)
+    assert policy.startswith("default-src 'none'; img-src data:;")
+    (script,) = re.findall("<script>(.*?)</script>", html, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in policy
 
 
 def test_it_tells_what_where_and_how_sure(tmp_path):
@@ -110,10 +124,36 @@ def test_a_run_that_ended_early_is_reported_too(tmp_path, state):
 
 def test_text_from_files_cannot_become_markup(tmp_path):
     pair = make_pair(500)
-    pair.source.cloud.name = "<script>alert(1)</script>.laz"
-    html = report(tmp_path, pair.with_(verdict=Verdict("doubtful", ("<b>&",), {"x": "<i>"})))
-    assert "<script" not in html
+    hostile = "<script>alert(1)<x y='\"'>{{ 7 * 7 }}"
+    pair.source.cloud.name = f"{hostile}.laz"
+    check = Check(hostile, hostile, hostile, False, hostile)
+    verdict = Verdict("doubtful", ("<b>&", hostile), {"x": "<i>", hostile: hostile}, (), hostile, (check,))
+    stage = {
+        "type": hostile,
+        "tag": hostile,
+        "options": {hostile: hostile},
+        "seconds": 1.0,
+        "failed": hostile,
+    }
+    written = {"files": [hostile], "withheld": [{"path": hostile, "why": hostile}], "forced": True}
+    facts = {
+        "versions": {hostile: hostile},
+        "inputs": [{"path": hostile}],
+        "command": hostile,
+        "written": written,
+    }
+    html = report(tmp_path, pair.with_(verdict=verdict), [stage], facts)
+    parser = Links()
+    parser.feed(html)
+    assert parser.open == []
+    assert parser.scripts == 1
+    assert "<script>alert" not in html
+    assert html.count("&lt;script&gt;alert(1)&lt;x y=") > 15
+    assert "<x" not in html
+    assert "49" not in re.sub('data:image[^"]*', "", html).partition("<main>")[2].partition("<svg")[0]
     assert "&lt;b&gt;&amp;" in html
+    assert "&lt;i&gt;" in html
+    assert "<i>" not in html
 
 
 def test_one_cloud_alone(tmp_path):
@@ -214,9 +254,42 @@ def test_residual_colours_run_from_green_to_red():
 
 def test_charts_count_every_tie():
     residual = np.array([0.0, 0.01, 0.5, 7.0])
-    svg = charts.histogram(residual, residual < 0.3, 1.0)
-    assert sum(int(number) for number in re.findall(r"<title>(\d+) tie points", svg)) == 4
-    assert "a &lt;b&gt;" in charts.bars([1.0, 0.0], ["a <b>", "c"])
+    agrees = residual < 0.3
+    chart = charts.histogram(residual, [(agrees, "green"), (~agrees, "red")], 0.0, 1.0, "tie points")
+    assert sum(int(number) for number in re.findall(r"<title>(\d+) tie points", chart.svg)) == 4
+    assert chart.svg.count('fill="red"') == 2
+    assert chart.top == 2
+
+
+def test_arrows_go_from_the_target_to_the_source():
+    target = np.array([[0.0, 0.0, 0.0], [100.0, 50.0, 0.0]])
+    residual = np.array([[1.0, 0.0], [0.0, -1.0]])
+    colours = np.full((2, 3), 9, np.uint8)
+    found = charts.residual_map(target, residual, colours, {})
+    (x, y, u, v), (p, q, r, s) = (
+        [float(number) for number in line]
+        for line in re.findall(r"M(\d+) (\d+)L(\d+) (\d+)\"", found.chart.svg)
+    )
+    scale = found.bar * 10.0 / found.bar_m  # pixels of the drawing a metre
+    assert u - x == pytest.approx(found.enlarged * scale, abs=1.0)
+    assert v == y
+    assert s - q == pytest.approx(found.enlarged * scale, abs=1.0)  # north is up, so south is down
+    assert r == p
+    assert p - x == pytest.approx(100.0 * scale, abs=1.0)
+    assert y - q == pytest.approx(50.0 * scale, abs=1.0)
+    assert found.shortened == 0
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(0.0, 1.0), (-0.5, 0.5), (-3.1, 4.7), (1234.5, 1301.0), (0, 47.2), (0, 3.99e-3)]
+)
+def test_ticks_are_round_and_few(low, high):
+    found = ticks(low, high, 6, "m")
+    assert 2 <= len(found) <= 7
+    values = [float(one.text.removesuffix(" m")) for one in found]
+    assert np.allclose([low + one.at / 100 * (high - low) for one in found], values, atol=1e-3 * (high - low))
+    assert np.allclose(np.diff(values), values[1] - values[0])
+    assert [one.text.endswith(" m") for one in found] == [False] * (len(found) - 1) + [True]
 
 
 def test_metrics_have_labels_and_units():

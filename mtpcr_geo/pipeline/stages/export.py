@@ -13,7 +13,7 @@ from pydantic import Field
 
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.recorder import NullRecorder
-from mtpcr_geo.core.system import peak_memory_mb
+from mtpcr_geo.core.system import command_line, peak_memory_mb
 from mtpcr_geo.core.types import Pair, Side, Verdict
 from mtpcr_geo.core.wording import visible
 from mtpcr_geo.crs.chain import TransformChain
@@ -383,7 +383,7 @@ class WriteReport(EvidenceWriter):
         done = [record.audit() for record in context.done]
         path = context.outputs.path(self.options.filename)
         written = Written.of(context.done, context.outputs.written())
-        facts = {**context.facts.audit(), "written": written.audit()}
+        facts = {**context.facts.audit(), "written": written.audit(), "command": command_line()}
         write_report(path, pair, done, facts)
 
 
