@@ -14,8 +14,8 @@ from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.recorder import NullRecorder, Recorder
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.export.recording import writer
-from mtpcr_geo.export.recording.recorder import RerunRecorder
 from mtpcr_geo.export.recording.budget import Budget
+from mtpcr_geo.export.recording.recorder import RerunRecorder
 
 # room for 2000 points of each input
 SMALL = Budget(16.0 * 2000 / 0.06 / 1e6)

@@ -110,7 +110,7 @@ def thin(xyz: Floats, most: int, seed: int, box: Floats | None = None) -> Floats
     # what one part cannot fill, the other gets
     of_near = min(len(near), max(most // 2, most - len(far)))
     kept = np.concatenate([near[_some(len(near), of_near, seed)], far[_some(len(far), most - of_near, seed)]])
-    return xyz[np.sort(kept)]
+    return np.asarray(xyz[np.sort(kept)])
 
 
 def _some(number: int, most: int, seed: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

@@ -110,14 +110,14 @@ def looks_of(pair: Pair, images: Mapping[str, tuple[int, int]]) -> dict[str, Loo
             middle = grid.to_pixel(levelled[role].middle[None, :2])[0] + 0.5
             spots[role] = Look(middle, levelled[role].size / grid.cell), side.bev
     for entity, (width, height) in images.items():
-        role = next((name for name in sides if f"/{name}" in f"/{entity}"), None)
-        if role in spots:
-            look, bev = spots[role]
+        of_one = [name for name in sides if f"/{name}" in f"/{entity}"]
+        if of_one and of_one[0] in spots:
+            look, bev = spots[of_one[0]]
             looks[entity] = Look(
                 look.middle * np.array([width / bev.grid.width, height / bev.grid.height]),
                 look.size * width / bev.grid.width,
             )
-        elif role is None and len(spots) == 2:
+        elif not of_one and len(spots) == 2:
             looks[entity] = _beside(spots["source"], spots["target"], width)
     return looks
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
-from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.types import Pair, Side
 from mtpcr_geo.core.version import __version__
 from mtpcr_geo.core.wording import visible
@@ -21,6 +20,7 @@ from mtpcr_geo.export.recording import bars, matching
 from mtpcr_geo.export.recording.budget import Budget, thin
 from mtpcr_geo.export.recording.focus import looks_of, overlap_boxes
 from mtpcr_geo.export.recording.layout import TIMELINE, Recorded, layout
+from mtpcr_geo.export.recording.trail import ENTITY, trail_json, what_was_made
 from mtpcr_geo.export.tie_points import footprints, tie_positions
 
 APPLICATION = "mtpcr_geo"
@@ -47,6 +47,7 @@ class RecordingWriter:
         self._stage = 0
         self._pen = matching.Pen(self._log, self._log_image, self._log_bars, budget)
         self._stages: list[tuple[str, str, float]] = []
+        self._trail: list[dict[str, Any]] = []
         self._options: dict[str, dict[str, Any]] = {}
         self._properties: dict[str, Any] = {}
         self._side_texts: dict[str, str] = {}
@@ -84,13 +85,16 @@ class RecordingWriter:
         self._stream.set_time(TIMELINE, sequence=self._stage)
         self._stages.append((tag, stage_type, seconds))
         self._options[tag] = options
-        made = _made(value, self._pair)
+        made = what_was_made(value, self._pair)
         if isinstance(value, Pair):
             self._log_pair(value)
         bad = "verdict" in made and "accepted" not in made
         level = rr.TextLogLevel.WARN if bad else rr.TextLogLevel.INFO
         line = f"{tag} ({stage_type}), {seconds:.2f} s: {made}"
         self._log("stages", rr.TextLog(visible(line), level=level))
+        self._trail.append(
+            {"tag": tag, "type": stage_type, "options": options, "seconds": seconds, "made": made}
+        )
         self._log("seconds", rr.Scalars(seconds))
         self._log("summary", self._markdown(self._summary()))
         self._stage += 1
@@ -99,6 +103,8 @@ class RecordingWriter:
         """Send the layout and finish the file."""
         self._stream.log("run", self._markdown(self._run_text()), static=True)
         self._log_bars("time", self._time_bars())
+        trail = trail_json(self._properties, self._trail, self._pair, self._drawn())
+        self._stream.log(ENTITY, rr.TextDocument(trail, media_type="application/json"), static=True)
         if self._pair is not None:
             self._recorded.looks = looks_of(self._pair, self._recorded.images)
         self._stream.send_blueprint(layout(self._recorded), make_active=True, make_default=True)
@@ -343,6 +349,11 @@ class RecordingWriter:
     def _markdown(text: str) -> Any:
         return rr.TextDocument(visible(text), media_type=rr.MediaType.MARKDOWN)
 
+    def _drawn(self) -> str:
+        if self._pair is None:
+            return ""
+        return self.budget.sentence(len(self._pair.source.sample), len(self._pair.target.sample))
+
     def _summary(self) -> str:
         pair = self._pair
         parts = []
@@ -353,7 +364,7 @@ class RecordingWriter:
         else:
             parts.append("# Not judged yet")
         if pair is not None:
-            parts.append(self.budget.sentence(len(pair.source.sample), len(pair.target.sample)))
+            parts.append(self._drawn())
             rows = descriptions.transform_rows(pair)
             if rows:
                 parts.append("## Transform\n\n" + descriptions.markdown_table(("what", "value"), rows))
@@ -395,30 +406,6 @@ class RecordingWriter:
                     f"## {name.capitalize()}\n\n" + "\n".join(f"- {descriptions.plain(v)}" for v in value)
                 )
         return "\n\n".join(parts) or "nothing was recorded"
-
-
-def _made(value: object, before: Pair | None) -> str:
-    """Return what a stage newly made, as a short text."""
-    if isinstance(value, Cloud):
-        return f"a cloud of {value.count:,} points, {Path(value.name).name}"
-    if not isinstance(value, Pair):
-        return "done"
-    if before is None:
-        return "both clouds in their work frames"
-    found = []
-    if value.target.bev is not None and value.target.bev is not before.target.bev:
-        found.append(f"rasters of {value.target.bev.grid.cell:g} m cells")
-    if value.matches is not None and value.matches is not before.matches:
-        found.append(f"{len(value.matches.score)} matches")
-    if value.tie_points is not None and value.tie_points is not before.tie_points:
-        found.append(
-            f"{len(value.tie_points.score)} tie points, {int(np.sum(value.tie_points.inlier))} agreeing"
-        )
-    if value.T_target_source is not None and value.T_target_source is not before.T_target_source:
-        found.append("a transform")
-    if value.verdict is not None and value.verdict is not before.verdict:
-        found.append(f"verdict {value.verdict.name}")
-    return ", ".join(found) or "done"
 
 
 def _bounds(xyz: Floats) -> Floats:
