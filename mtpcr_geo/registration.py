@@ -327,7 +327,7 @@ def register(
             return Registration(run(nodes, progress=progress), chosen)
     # kept in a temporary folder until it is saved; deleted together with the registration
     folder = Path(tempfile.mkdtemp(prefix="mtpcr-geo-"))
-    nodes += chained([recording_writer(folder)], (nodes[-1].tag,))
+    nodes += chained([recording_writer(folder, chosen.recording_mb)], (nodes[-1].tag,))
     try:
         with cores(chosen.threads):
             result = run(nodes, progress=progress)

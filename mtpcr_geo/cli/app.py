@@ -69,6 +69,14 @@ VERBS = {
         "Run a pipeline of this package's stages and PDAL's, written as PDAL's JSON.",
         more=True,
     ),
+    "review": Verb(
+        "mtpcr_geo.cli.review:command",
+        "Print the audit trail that a recording holds, and open it in the rerun viewer.",
+    ),
+    "verify": Verb(
+        "mtpcr_geo.cli.verify:command",
+        "Run a registration again from its record, and compare: inputs, options, versions and result.",
+    ),
     "models": Verb(
         "mtpcr_geo.cli.models:command",
         "List the learned matchers: which files are there, their licences, and who publishes those missing.",

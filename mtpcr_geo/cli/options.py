@@ -7,7 +7,7 @@ are declared in `mtpcr_geo.pipeline.options`, or here where nothing but the comm
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -49,6 +49,10 @@ QuietVerdict = Annotated[
     bool,
     Field(description="print nothing but errors, and one line where the verdict is not accepted"),
     Shown(OUTPUT, ("--quiet", "-q")),
+]
+AllowCode = Annotated[bool, Field(description="let stages such as filters.python run code"), Shown(RUN)]
+AllowNetwork = Annotated[
+    bool, Field(description="let stages read remote or virtual (/vsi) files"), Shown(RUN)
 ]
 
 
@@ -95,12 +99,8 @@ class PipelineVerb(VerbOptions):
         Field(description="check grammar, options, files and CRS; run nothing"),
         Shown(RUN, ("--validate",)),
     ] = False
-    allow_code: Annotated[
-        bool, Field(description="let stages such as filters.python run code"), Shown(RUN)
-    ] = False
-    allow_network: Annotated[
-        bool, Field(description="let stages read remote or virtual (/vsi) files"), Shown(RUN)
-    ] = False
+    allow_code: AllowCode = False
+    allow_network: AllowNetwork = False
     metadata: Annotated[
         Path | None, Field(description="JSON file to write what the stages report to"), Shown(OUTPUT)
     ] = None
@@ -174,6 +174,44 @@ class CheckVerb(VerbOptions):
     within: Within = None
     as_json: AsJson = False
     quiet: Quiet = False
+
+
+class ReviewVerb(VerbOptions):
+    """Options of ``review``."""
+
+    recording: Annotated[
+        Path, Field(description="folder that a run left, or its .rrd file"), Shown(INPUTS, argument=True)
+    ]
+    viewer: Annotated[
+        Literal["auto", "window", "browser", "none"],
+        Field(
+            description="where to open the recording: auto is a window where standard output is a terminal "
+            "and there is a display; browser serves it to this machine until Ctrl-C"
+        ),
+        Shown(OUTPUT, ("--open",)),
+    ] = "auto"
+    as_json: AsJson = False
+    verbose: Annotated[
+        bool,
+        Field(description="all options of every stage, and what each check means"),
+        Shown(OUTPUT, ("--verbose", "-v")),
+    ] = False
+
+
+class VerifyVerb(VerbOptions):
+    """Options of ``verify``."""
+
+    folder: Annotated[
+        Path, Field(description="folder that a registration left"), Shown(INPUTS, argument=True)
+    ]
+    allow_code: AllowCode = False
+    allow_network: AllowNetwork = False
+    as_json: AsJson = False
+    quiet: Annotated[
+        bool,
+        Field(description="print nothing but errors, and one line where the run is not reproduced"),
+        Shown(OUTPUT, ("--quiet", "-q")),
+    ] = False
 
 
 class ModelsVerb(VerbOptions):

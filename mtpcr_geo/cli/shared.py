@@ -44,6 +44,11 @@ def say(text: str) -> None:
     typer.echo(visible(text))
 
 
+def note(text: str) -> None:
+    """Print a remark in one line on standard error."""
+    typer.echo(one_line(f"mtpcr-geo: {text}"), err=True)
+
+
 def warn(text: str) -> None:
     """Print a warning in one line on standard error."""
     typer.echo(one_line(f"mtpcr-geo: warning: {text}"), err=True)

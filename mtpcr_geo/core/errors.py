@@ -14,6 +14,7 @@ code  meaning
 6     the coordinate reference systems do not allow it
 7     an output cannot be written
 8     an optional part (PDAL, a model file) is missing
+9     ``verify``: the run was not reproduced, or what it came from has changed
 70    a defect of the program itself (please report it)
 130   interrupted
 ====  ==============================================================
@@ -23,6 +24,7 @@ from mtpcr_geo.core.wording import visible
 
 EXIT_DOUBTFUL = 3
 EXIT_REFUSED = 4
+EXIT_DIFFERENT = 9
 EXIT_DEFECT = 70
 EXIT_INTERRUPTED = 130
 

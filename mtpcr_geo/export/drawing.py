@@ -21,6 +21,8 @@ BAD_RGB = (220, 50, 40)
 HELD_OUT_RGB = (70, 170, 255)
 UNJUDGED_RGB = (250, 220, 80)
 EMPTY_RGB = (32, 34, 40)
+MATCH_SIDE, MATCH_GAP = 2048, 12
+"""Longest side of a raster in a picture of matches, cells, and the gap between both, pixels."""
 
 _SMOOTH_CELLS = 0.7
 _LOCAL_MEAN_M = 12.0
@@ -139,7 +141,7 @@ def side_by_side(left: Picture, right: Picture, gap: int = 12) -> tuple[Picture,
 
 
 def match_lines(
-    pair: Pair, gap: int = 12, max_side: int = 2048
+    pair: Pair, gap: int = MATCH_GAP, max_side: int = MATCH_SIDE
 ) -> tuple[Picture, Floats, NDArray[np.uint8], NDArray[np.int8]]:
     """Return both BEVs side by side (source left) with the lines that link them.
 

@@ -304,6 +304,12 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.assess surface_residual``: how badly flat surfaces meet under the result and under the prior: 0 all
   meet, 1 none does; null where there are too few
 - ``mtpcr.assess prior_kept``: whether the prior was kept
+- ``mtpcr.write_recording size_mb``: size that the recording may have, megabytes
+- ``mtpcr.write_recording points_source``: points of the source in memory
+- ``mtpcr.write_recording points_source_shown``: of these, points drawn of the aligned source
+- ``mtpcr.write_recording points_target``: points of the target in memory
+- ``mtpcr.write_recording points_target_shown``: of these, points drawn of the target
+- ``mtpcr.write_recording picture_side``: longest side of a picture, pixels
 - ``writers.las filename``: the file
 - ``writers.las count``: points written
 """

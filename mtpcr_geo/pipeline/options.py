@@ -18,6 +18,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from mtpcr_geo.core.suggestions import meant
 from mtpcr_geo.core.units import UNITS, Axes, Unit
+from mtpcr_geo.export.recording.budget import DEFAULT_MB, LEAST_MB
 from mtpcr_geo.pipeline.file_options import Also, Scale, SourceText, TargetText
 from mtpcr_geo.pipeline.shown import (
     INPUTS,
@@ -361,6 +362,16 @@ class MethodOptions(PriorOptions):
     seed: Seed = 0
 
 
+RecordingMb = Annotated[
+    float,
+    Field(
+        ge=LEAST_MB,
+        description="size that the recording may have, megabytes: points and pictures are thinned to it",
+    ),
+    Shown(OUTPUT, metavar="MB"),
+]
+
+
 class RegisterOptions(MethodOptions):
     """Options of a registration: of the method, and of what it writes."""
 
@@ -371,6 +382,7 @@ class RegisterOptions(MethodOptions):
     recording: Annotated[
         bool, Field(description="write a recording of the run for the rerun viewer"), Shown(OUTPUT)
     ] = True
+    recording_mb: RecordingMb = DEFAULT_MB
     force: Force = False
     overwrite: Overwrite = False
     threads: Threads = 0

@@ -19,6 +19,7 @@ from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.core.types import Verdict
 from mtpcr_geo.core.wording import visible
+from mtpcr_geo.export.recording.budget import Budget
 from mtpcr_geo.export.recording.recorder import RerunRecorder
 from mtpcr_geo.io.write import write_cloud
 
@@ -98,7 +99,7 @@ def test_names_reach_no_recording(tmp_path):
     from rerun.chunk import RrdReader
 
     pair = make_pair()
-    recorder = RerunRecorder(tmp_path / "a.rrd", budget=100)
+    recorder = RerunRecorder(tmp_path / "a.rrd", Budget(0.5))
     facts = {"pipeline": [{"type": HOSTILE, "tag": HOSTILE, "filename": HOSTILE}], "versions": {},
              "inputs": [{"path": HOSTILE, "bytes": 1, "sha256": HOSTILE}], "started": 1.0}  # fmt: skip
     recorder.begin(facts)

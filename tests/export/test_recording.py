@@ -14,8 +14,11 @@ from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.recorder import NullRecorder, Recorder
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.export.recording import writer
+from mtpcr_geo.export.recording.budget import Budget
 from mtpcr_geo.export.recording.recorder import RerunRecorder
 
+# room for 2000 points of each input
+SMALL = Budget(16.0 * 2000 / 0.06 / 1e6)
 FACTS = {
     "pipeline": [{"type": "readers.las", "tag": "target", "filename": "target.laz"}],
     "versions": {"numpy": "2.0", "opencv-python-headless": "4"},
@@ -46,7 +49,7 @@ def states(pair: Pair):
     ]
 
 
-def record(path, pair: Pair, budget: int = 2000) -> None:
+def record(path, pair: Pair, budget: Budget = SMALL) -> None:
     recorder: Recorder = RerunRecorder(path, budget=budget)
     recorder.begin(FACTS)
     for tag, value in states(pair):
@@ -119,7 +122,7 @@ def test_clouds_keep_to_the_budget_and_the_work_frame(whole):
     assert xyz.shape == (2000, 3)
     known = {tuple(point) for point in pair.target.sample.astype(np.float32).tolist()}
     assert all(tuple(point) in known for point in xyz.astype(np.float32).tolist())
-    assert len(positions(whole, "/levelled/source")) == 1000
+    assert len(positions(whole, "/levelled/source")) == 1666
 
 
 def test_the_aligned_source_lies_on_the_target(whole):
@@ -171,7 +174,7 @@ def test_same_run_same_points(tmp_path, whole):
 
 @pytest.mark.parametrize("state", ["levelled", "matched", "tied", "solved"])
 def test_a_run_that_ended_early_is_recorded_too(tmp_path, state):
-    record(tmp_path / "a.rrd", make_pair(800, state=state, crs=None), budget=500)
+    record(tmp_path / "a.rrd", make_pair(800, state=state, crs=None), budget=SMALL)
     found = entities(tmp_path / "a.rrd")
     assert "/levelled/source" in found
     assert "/map/target" not in found
@@ -181,7 +184,7 @@ def test_a_run_that_ended_early_is_recorded_too(tmp_path, state):
 
 def test_one_cloud_alone(tmp_path):
     target = make_pair(800).target
-    recorder = RerunRecorder(tmp_path / "a.rrd", budget=500)
+    recorder = RerunRecorder(tmp_path / "a.rrd", budget=SMALL)
     recorder.begin({})
     recorder.after("mtpcr.bev", "bev", {}, Pair(target, target, make_pair(500).frame), 0.1)
     recorder.close()

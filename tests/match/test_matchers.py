@@ -320,10 +320,15 @@ def test_focus_matches_again_where_overlap_is_small():
     assert reported["applied"]
     assert reported["agreeing_after"] > reported["agreeing_before"]
     assert forced.before_focus is first
+    from mtpcr_geo.export.recording.budget import Budget
     from mtpcr_geo.export.recording.matching import Pen, log_focus
 
     logged: list[str] = []
-    pen = Pen(lambda path, what: logged.append(path), lambda path, picture: logged.append(path))
+
+    def note(path: str, what: object) -> None:
+        logged.append(path)
+
+    pen = Pen(note, note, note, Budget())
     log_focus(pen, pair.with_(matches=forced))
     assert logged == ["focus/before/image", "focus/before/lines", "focus/after/image", "focus/after/lines"]
     # still on the pixels of the rasters given

@@ -8,8 +8,15 @@ from typing import Any
 import numpy as np
 
 from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.export.recording import bars
+from mtpcr_geo.export.recording.focus import Look
 
 TIMELINE = "stage"
+AWAY = np.array([0.0, -0.75, 0.8])
+"""From the middle of the overlap to the eye, in diameters of the overlap."""
+MARGIN = 0.7
+"""Half of what a picture shows, in diameters of the overlap."""
+_BACKGROUND = (18, 20, 24)
 
 
 @dataclass(eq=False)
@@ -20,12 +27,16 @@ class Recorded:
         paths: entities that hold something.
         bounds: (2, 3) lowest and highest coordinates by entity root, metres, for the first view.
         images: (width, height) in pixels by entity root.
+        bars: number of bars by entity.
+        looks: the overlap, by entity root; empty where there is none.
 
     """
 
     paths: set[str] = field(default_factory=set)
     bounds: dict[str, Floats] = field(default_factory=dict)
     images: dict[str, tuple[int, int]] = field(default_factory=dict)
+    bars: dict[str, int] = field(default_factory=dict)
+    looks: dict[str, Look] = field(default_factory=dict)
 
     def has(self, root: str) -> bool:
         """Return whether something was recorded at or below an entity."""
@@ -54,9 +65,9 @@ def layout(recorded: Recorded) -> Any:
         ),
         rrb.Tabs(
             rrb.TextLogView(origin="stages", name="Stages", columns=_log_columns()),
-            rrb.TimeSeriesView(origin="seconds", name="Seconds a stage"),
+            _bars(recorded, "time", "Seconds a stage"),
         ),
-        row_shares=[3, 1],
+        row_shares=[2, 1],
     )
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Tabs(*shown, active_tab=0), texts, column_shares=[5, 2]) if shown else texts,
@@ -117,10 +128,10 @@ def _matches(recorded: Recorded) -> Any:
     if not recorded.has("hypotheses"):
         return rrb.Horizontal(matches, name="Matches")
     below = rrb.Horizontal(
-        rrb.BarChartView(origin="hypotheses/scores", name="Strength of each candidate pose"),
+        _bars(recorded, "hypotheses/scores", "Candidate poses: yaw and strength"),
         rrb.TextDocumentView(origin="hypotheses/table", name="Candidate poses"),
     )
-    return rrb.Vertical(matches, below, row_shares=[3, 1], name="Matches")
+    return rrb.Vertical(matches, below, row_shares=[2, 1], name="Matches")
 
 
 def _keypoints(recorded: Recorded) -> Any:
@@ -138,7 +149,7 @@ def _keypoints(recorded: Recorded) -> Any:
             grids.append(rrb.Grid(*views, grid_columns=2, name=title))
     if recorded.has("sweep"):
         charts = [
-            rrb.BarChartView(origin=f"sweep/{what}", name=f"{title} by rotation of the source, degrees")
+            _bars(recorded, f"sweep/{what}", f"{title} by rotation of the source, degrees")
             for what, title in (("agreeing", "Agreeing matches"), ("matches", "Matches"))
         ]
         grids.append(rrb.Vertical(*charts, name="Sweep"))
@@ -161,15 +172,15 @@ def _ties(recorded: Recorded) -> Any:
     space = _space(
         recorded, "aligned", "Tie points by residual: green fits, red does not", hide=("source", "links")
     )
-    chart = rrb.BarChartView(origin="residuals", name="Tie points by residual in centimetres")
-    return rrb.Vertical(space, chart, row_shares=[3, 1], name="Tie points")
+    chart = _bars(recorded, "residuals", "Number of tie points by residual")
+    return rrb.Horizontal(space, chart, column_shares=[3, 1], name="Tie points")
 
 
 def _inputs(recorded: Recorded) -> Any:
     import rerun.blueprint as rrb
 
     views = [
-        _space(recorded, f"input/{role}", f"{role.capitalize()} as read, by height", away=1.5)
+        _space(recorded, f"input/{role}", f"{role.capitalize()} as read, by height")
         for role in ("source", "target")
         if recorded.has(f"input/{role}")
     ]
@@ -182,40 +193,60 @@ def _map(recorded: Recorded) -> Any:
     return rrb.MapView(origin="map", name="Map") if recorded.has("map") else None
 
 
-def _space(recorded: Recorded, origin: str, name: str, hide: tuple[str, ...] = (), away: float = 1.0) -> Any:
-    """Return a 3D view that looks from the south, half from above, at all that is there."""
+def _space(recorded: Recorded, origin: str, name: str, hide: tuple[str, ...] = ()) -> Any:
+    """Return a 3D view that looks from the south, half from above, at the overlap, or else at everything."""
     import rerun.blueprint as rrb
 
     contents = ["$origin/**", *(f"- $origin/{path}/**" for path in hide)]
-    eye = None
+    look = recorded.looks.get(origin)
     bounds = recorded.bounds.get(origin)
-    if bounds is not None:
-        middle = bounds.mean(axis=0)
-        width = float(np.linalg.norm(bounds[1, :2] - bounds[0, :2])) or 10.0
+    if look is None and bounds is not None:
+        look = Look(bounds.mean(axis=0), float(np.linalg.norm(bounds[1, :2] - bounds[0, :2])) or 10.0)
+    eye = None
+    if look is not None:
         eye = rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=middle + away * width * np.array([0.0, -0.46, 0.5]),
-            look_target=middle - width * np.array([0.0, 0.03, 0.0]),
+            position=look.middle + look.size * AWAY,
+            look_target=look.middle,
             eye_up=(0.0, 0.0, 1.0),
         )
     return rrb.Spatial3DView(
         origin=origin,
         contents=contents,
         name=name,
-        background=(18, 20, 24),
+        background=_BACKGROUND,
         line_grid=False,
         eye_controls=eye,
     )
 
 
 def _flat(recorded: Recorded, origin: str, name: str) -> Any:
+    """Return a 2D view: the overlap in its middle, or else the whole picture."""
     import rerun.blueprint as rrb
 
     if not recorded.has(origin):
         return None
     bounds = None
-    size = recorded.images.get(origin) or recorded.images.get(f"{origin}/image")
-    if size is not None:
-        width, height = size
-        bounds = rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height))
-    return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds, background=(18, 20, 24))
+    image = next((path for path in (origin, f"{origin}/image") if path in recorded.images), None)
+    if image is not None:
+        width, height = recorded.images[image]
+        look = recorded.looks.get(image)
+        if look is None:
+            bounds = rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height))
+        else:
+            (left, top), (right, bottom) = look.middle - MARGIN * look.size, look.middle + MARGIN * look.size
+            bounds = rrb.VisualBounds2D(x_range=(left, right), y_range=(top, bottom))
+    return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds, background=_BACKGROUND)
+
+
+def _bars(recorded: Recorded, origin: str, name: str) -> Any:
+    """Return a 2D view of labelled bars."""
+    import rerun.blueprint as rrb
+
+    x_range, y_range = bars.bounds(recorded.bars.get(origin, 1))
+    return rrb.Spatial2DView(
+        origin=origin,
+        name=name,
+        visual_bounds=rrb.VisualBounds2D(x_range=x_range, y_range=y_range),
+        background=_BACKGROUND,
+    )

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import rerun as rr
 
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.types import Pair, Side
 from mtpcr_geo.export import drawing
+from mtpcr_geo.export.recording import bars
+from mtpcr_geo.export.recording.budget import Budget
 
-_IMAGE_SIDE = 2048
 _KEYPOINT_RGB = (255, 190, 60)
-_MOST_KEYPOINTS = 20_000
 
 
 @dataclass(frozen=True)
@@ -24,12 +23,16 @@ class Pen:
 
     Attributes:
         log: logs something under an entity path.
-        image: logs a picture under an entity path, shrunk to a largest side of 2048.
+        image: logs a picture under an entity path, shrunk to the budget's longest side.
+        bars: logs labelled bars under an entity path.
+        budget: how much may be logged.
 
     """
 
     log: Callable[[str, Any], None]
     image: Callable[[str, drawing.Picture], None]
+    bars: Callable[[str, Sequence[bars.Bar]], None]
+    budget: Budget
 
 
 def log_appearance(pen: Pen, side: Side) -> None:
@@ -53,13 +56,13 @@ def log_keypoints(pen: Pen, pair: Pair) -> None:
             continue
         root = f"keypoints/{side.role}"
         pen.image(f"{root}/image", side.appearance.image)
-        scale = min(1.0, _IMAGE_SIDE / max(side.appearance.image.shape))
+        scale = min(1.0, pen.budget.picture_side / max(side.appearance.image.shape))
         for name, px, rgb, radius in (
             ("all", found, _KEYPOINT_RGB, 1.5),
             ("matched", used, drawing.UNJUDGED_RGB, 3.0),
         ):
             # rerun's pixels have their centres at halves
-            at = (px[:_MOST_KEYPOINTS] + 0.5) * scale
+            at = (px[:: -(-len(px) // pen.budget.keypoints) or 1] + 0.5) * scale
             pen.log(
                 f"{root}/{name}",
                 rr.Points2D(at, colors=rgb, radii=rr.Radius.ui_points(radius), draw_order=10.0 + radius),
@@ -72,12 +75,13 @@ def log_sweep(pen: Pen, pair: Pair) -> None:
     turns = reported.get("turns_deg")
     if not turns or len(turns) < 2:
         return
-    step = 360.0 / len(turns)
     for name in ("agreeing", "matches"):
-        counts = np.array(reported[f"turn_{name}"], np.float64)
-        widths = np.full(len(turns), 0.8 * step, np.float32)
-        left = np.array(turns, np.float64) - 0.4 * step
-        pen.log(f"sweep/{name}", rr.BarChart(counts, abscissa=left, widths=widths, color=drawing.GOOD_RGB))
+        counts = reported[f"turn_{name}"]
+        shown = [
+            bars.Bar(f"{turn:g}°: {count}", float(count), drawing.GOOD_RGB)
+            for turn, count in zip(turns, counts, strict=True)
+        ]
+        pen.bars(f"sweep/{name}", shown)
 
 
 def log_focus(pen: Pen, pair: Pair) -> None:
@@ -89,6 +93,6 @@ def log_focus(pen: Pen, pair: Pair) -> None:
         bare = pair.with_(matches=one, tie_points=None, T_target_source=None)
         picture, ends, colours, _ = drawing.match_lines(bare)
         pen.image(f"focus/{name}/image", picture)
-        at: Floats = (ends + 0.5) * min(1.0, _IMAGE_SIDE / max(picture.shape[:2]))
+        at: Floats = (ends + 0.5) * min(1.0, pen.budget.picture_side / max(picture.shape[:2]))
         lines = rr.LineStrips2D(at, colors=colours, radii=rr.Radius.ui_points(0.8), draw_order=20.0)
         pen.log(f"focus/{name}/lines", lines)

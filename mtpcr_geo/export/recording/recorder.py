@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mtpcr_geo.core.errors import OutputError
-
-DEFAULT_BUDGET = 200_000
+from mtpcr_geo.export.recording.budget import Budget
 
 
 class RerunRecorder:
@@ -24,7 +23,7 @@ class RerunRecorder:
 
     Args:
         path: the file to write; renamed by the caller once the run is whole.
-        budget: points a cloud and picture at most; larger clouds are thinned by a seeded choice.
+        budget: how large the file may become: points are thinned by a seeded choice, pictures shrunk.
         seed: of the thinning.
 
     Raises:
@@ -32,12 +31,13 @@ class RerunRecorder:
 
     """
 
-    def __init__(self, path: str | os.PathLike[str], budget: int = DEFAULT_BUDGET, seed: int = 0) -> None:
+    def __init__(self, path: str | os.PathLike[str], budget: Budget | None = None, seed: int = 0) -> None:
         self.path = Path(path)
+        self.budget = budget or Budget()
         self._worker: ThreadPoolExecutor | None = ThreadPoolExecutor(1, thread_name_prefix="recording")
         self._jobs: list[Future[None]] = []
         self._writer: Any = None
-        self._submit(self._open, budget, seed)
+        self._submit(self._open, self.budget, seed)
 
     def begin(self, properties: dict[str, Any]) -> None:
         """Note what holds for the whole run: CRS, origin, file hashes, versions, options."""
@@ -75,7 +75,7 @@ class RerunRecorder:
             raise ValueError("the recording is closed")
         self._jobs.append(self._worker.submit(job, *arguments))
 
-    def _open(self, budget: int, seed: int) -> None:
+    def _open(self, budget: Budget, seed: int) -> None:
         from mtpcr_geo.export.recording.writer import RecordingWriter
 
         self._writer = RecordingWriter(self.path, budget, seed)

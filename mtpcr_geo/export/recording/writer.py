@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +12,20 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
-from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.types import Pair, Side
 from mtpcr_geo.core.version import __version__
 from mtpcr_geo.core.wording import visible
 from mtpcr_geo.export import descriptions, drawing
-from mtpcr_geo.export.recording import matching
+from mtpcr_geo.export.recording import bars, matching
+from mtpcr_geo.export.recording.budget import Budget, thin
+from mtpcr_geo.export.recording.focus import looks_of, overlap_boxes
 from mtpcr_geo.export.recording.layout import TIMELINE, Recorded, layout
+from mtpcr_geo.export.recording.trail import ENTITY, trail_json, what_was_made
 from mtpcr_geo.export.tie_points import footprints, tie_positions
 
 APPLICATION = "mtpcr_geo"
 _ROLE_RGB = {"source": drawing.SOURCE_RGB, "target": drawing.TARGET_RGB}
-_IMAGE_SIDE = 2048
+_SHOWN_S = 0.05
 _KINDS = ("disagreeing", "agreeing", "held_out", "unjudged")
 
 
@@ -32,22 +34,24 @@ class RecordingWriter:
 
     Args:
         path: the `.rrd` to write.
-        budget: points a cloud and picture at most.
+        budget: how large the file may become.
         seed: of the thinning.
 
     """
 
-    def __init__(self, path: Path, budget: int, seed: int) -> None:
+    def __init__(self, path: Path, budget: Budget, seed: int) -> None:
         self.budget = budget
         self.seed = seed
         self._recorded = Recorded()
         self._seen: dict[str, object] = {}
         self._stage = 0
-        self._pen = matching.Pen(self._log, self._log_image)
+        self._pen = matching.Pen(self._log, self._log_image, self._log_bars, budget)
         self._stages: list[tuple[str, str, float]] = []
+        self._trail: list[dict[str, Any]] = []
         self._options: dict[str, dict[str, Any]] = {}
         self._properties: dict[str, Any] = {}
         self._side_texts: dict[str, str] = {}
+        self._times: dict[tuple[str, str], int] = {}
         self._pair: Pair | None = None
         self._stream = rr.RecordingStream(APPLICATION, send_properties=False)
         # one clock only: the stages
@@ -81,13 +85,16 @@ class RecordingWriter:
         self._stream.set_time(TIMELINE, sequence=self._stage)
         self._stages.append((tag, stage_type, seconds))
         self._options[tag] = options
-        made = _made(value, self._pair)
+        made = what_was_made(value, self._pair)
         if isinstance(value, Pair):
             self._log_pair(value)
         bad = "verdict" in made and "accepted" not in made
         level = rr.TextLogLevel.WARN if bad else rr.TextLogLevel.INFO
         line = f"{tag} ({stage_type}), {seconds:.2f} s: {made}"
         self._log("stages", rr.TextLog(visible(line), level=level))
+        self._trail.append(
+            {"tag": tag, "type": stage_type, "options": options, "seconds": seconds, "made": made}
+        )
         self._log("seconds", rr.Scalars(seconds))
         self._log("summary", self._markdown(self._summary()))
         self._stage += 1
@@ -95,6 +102,11 @@ class RecordingWriter:
     def close(self) -> None:
         """Send the layout and finish the file."""
         self._stream.log("run", self._markdown(self._run_text()), static=True)
+        self._log_bars("time", self._time_bars())
+        trail = trail_json(self._properties, self._trail, self._pair, self._drawn())
+        self._stream.log(ENTITY, rr.TextDocument(trail, media_type="application/json"), static=True)
+        if self._pair is not None:
+            self._recorded.looks = looks_of(self._pair, self._recorded.images)
         self._stream.send_blueprint(layout(self._recorded), make_active=True, make_default=True)
         self._stream.flush()
         self._stream.disconnect()
@@ -146,22 +158,22 @@ class RecordingWriter:
         self._send_properties("frame", frame)
 
     def _log_input(self, side: Side) -> None:
-        xyz = self._thin(side.sample, self.budget)
+        xyz = self._thin(side.sample, "input", side.role)
         colours = drawing.height_colours(xyz[:, 2], *drawing.height_range(xyz[:, 2]))
         self._log_points(f"input/{side.role}", xyz, colours, root=f"input/{side.role}")
 
     def _log_levelled(self, side: Side) -> None:
-        xyz = transforms.apply(side.T_level_work, self._thin(side.sample, self.budget // 2))
+        xyz = transforms.apply(side.T_level_work, self._thin(side.sample, "levelled", side.role))
         self._log_points(f"levelled/{side.role}", xyz, _tinted(xyz, side.role), root="levelled")
 
     def _log_bev(self, side: Side) -> None:
         bev = side.bev
         assert bev is not None
         path = f"bev/{side.role}"
-        top, cell, _ = drawing.thinned(bev, _IMAGE_SIDE)
+        top, cell, _ = drawing.thinned(bev, self.budget.picture_side)
         self._log_image(f"{path}/relief", drawing.shaded_relief(top, cell))
         self._log_image(f"{path}/bandpass", drawing.band_grey(top, cell))
-        top = np.ascontiguousarray(top)
+        top = np.ascontiguousarray(drawing.thinned(bev, self.budget.height_side)[0])
         low, high = drawing.height_range(top[np.isfinite(top)])
         image = rr.DepthImage(top, meter=1.0, colormap="viridis", depth_range=(low, high))
         self._log(f"{path}/height", image)
@@ -172,21 +184,28 @@ class RecordingWriter:
         if not pair.matches.hypotheses:
             return
         hypotheses = pair.matches.hypotheses
-        scores = np.array([one.score if one.strength is None else one.strength for one in hypotheses])
-        ranks = np.arange(len(scores), dtype=np.float64) + 0.5  # a bar's left edge
-        self._log("hypotheses/scores", rr.BarChart(scores, abscissa=ranks, color=drawing.UNJUDGED_RGB))
+        rows = descriptions.hypothesis_rows(pair)
+        shown = [
+            bars.Bar(
+                f"{row[0]}: {row[1]}, {row[3]}",
+                float(one.score if one.strength is None else one.strength),
+                drawing.UNJUDGED_RGB,
+            )
+            for one, row in zip(hypotheses, rows, strict=False)
+        ]
+        self._log_bars("hypotheses/scores", shown)
         strong = hypotheses[0].strength is not None
         head = ("rank", "yaw", "shift", "strength" if strong else "score", "overlap")
         self._log(
             "hypotheses/table",
-            self._markdown(descriptions.markdown_table(head, descriptions.hypothesis_rows(pair))),
+            self._markdown(descriptions.markdown_table(head, rows)),
         )
 
     def _log_matches(self, pair: Pair) -> None:
         if pair.source.bev is None or pair.target.bev is None:
             return
         picture, ends, colours, kind = drawing.match_lines(pair)
-        scale = min(1.0, _IMAGE_SIDE / max(picture.shape[:2]))
+        scale = min(1.0, self.budget.picture_side / max(picture.shape[:2]))
         if self._new("matches picture", (pair.source.bev, pair.target.bev)):
             self._log_image("matches/image", picture)
         self._recorded.images["matches"] = self._recorded.images["matches/image"]
@@ -215,11 +234,12 @@ class RecordingWriter:
         T = pair.T_target_source
         assert T is not None
         if self._new("aligned", pair.source.sample):
+            regions = overlap_boxes(pair)
             for side in (pair.source, pair.target):
-                xyz = self._thin(side.sample, self.budget)
+                xyz = self._thin(side.sample, "aligned", side.role, regions.get(side.role))
                 self._log_points(f"aligned/{side.role}/points", xyz, _tinted(xyz, side.role))
         self._log("aligned/source", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
-        placed = transforms.apply(T, self._thin(pair.source.sample, 10_000))
+        placed = transforms.apply(T, pair.source.sample[:: max(1, len(pair.source.sample) // 10_000)])
         self._recorded.bounds["aligned"] = _bounds(placed)
 
     def _log_ties(self, pair: Pair) -> None:
@@ -245,13 +265,12 @@ class RecordingWriter:
         )
         self._log("aligned/tie_points", values)
         top = max(float(np.percentile(residual, 95)), 0.05)
-        counts, edges = np.histogram(np.clip(residual, 0.0, top), bins=30, range=(0.0, top))
-        left_cm = 100.0 * edges[:-1]
-        widths = np.full(len(counts), 100.0 * (edges[1] - edges[0]), np.float32)
-        chart = rr.BarChart(
-            counts.astype(np.float64), abscissa=left_cm, widths=widths, color=drawing.GOOD_RGB
-        )
-        self._log("residuals", chart)
+        counts, edges = np.histogram(np.clip(residual, 0.0, top), bins=10, range=(0.0, top))
+        shown = [
+            bars.Bar(f"{100 * low:.0f}-{100 * high:.0f} cm: {count}", float(count), drawing.GOOD_RGB)
+            for low, high, count in zip(edges[:-1], edges[1:], counts, strict=True)
+        ]
+        self._log_bars("residuals", shown)
 
     def _log_map(self, pair: Pair) -> None:
         from pyproj import Transformer
@@ -283,9 +302,21 @@ class RecordingWriter:
             self._recorded.bounds[root] = bounds
 
     def _log_image(self, path: str, picture: drawing.Picture) -> None:
-        picture = drawing.fit(picture, _IMAGE_SIDE)
+        picture = drawing.fit(picture, self.budget.picture_side)
         self._recorded.images[path] = (picture.shape[1], picture.shape[0])
         self._log(path, rr.EncodedImage(contents=drawing.jpeg(picture), media_type="image/jpeg"))
+
+    def _log_bars(self, path: str, shown: Sequence[bars.Bar]) -> None:
+        if shown:
+            self._recorded.bars[path] = len(shown)
+            self._log(path, bars.drawn(shown))
+
+    def _time_bars(self) -> list[bars.Bar]:
+        return [
+            bars.Bar(f"{tag}: {seconds:.2f} s", seconds, drawing.TARGET_RGB)
+            for tag, _, seconds in self._stages
+            if seconds >= _SHOWN_S
+        ]
 
     def _log(self, path: str, what: Any) -> None:
         self._stream.log(path, what)
@@ -301,12 +332,10 @@ class RecordingWriter:
         self._seen[what] = value
         return not same
 
-    def _thin(self, xyz: Floats, budget: int) -> Floats:
-        if len(xyz) <= budget:
-            return xyz
-        # one point from each of `budget` equal runs: in file order, without repeats, not on a beat
-        jitter = np.random.default_rng(self.seed).random(budget)
-        return xyz[((np.arange(budget) + jitter) * (len(xyz) / budget)).astype(np.int64)]
+    def _thin(self, xyz: Floats, view: str, role: str, box: Floats | None = None) -> Floats:
+        times = self._times.get((view, role), 0)
+        self._times[view, role] = times + 1
+        return thin(xyz, self.budget.points(view, times), self.seed, box)
 
     def _send_properties(self, name: str, values: Mapping[str, Any]) -> None:
         texts = {
@@ -320,6 +349,11 @@ class RecordingWriter:
     def _markdown(text: str) -> Any:
         return rr.TextDocument(visible(text), media_type=rr.MediaType.MARKDOWN)
 
+    def _drawn(self) -> str:
+        if self._pair is None:
+            return ""
+        return self.budget.sentence(len(self._pair.source.sample), len(self._pair.target.sample))
+
     def _summary(self) -> str:
         pair = self._pair
         parts = []
@@ -330,6 +364,7 @@ class RecordingWriter:
         else:
             parts.append("# Not judged yet")
         if pair is not None:
+            parts.append(self._drawn())
             rows = descriptions.transform_rows(pair)
             if rows:
                 parts.append("## Transform\n\n" + descriptions.markdown_table(("what", "value"), rows))
@@ -371,30 +406,6 @@ class RecordingWriter:
                     f"## {name.capitalize()}\n\n" + "\n".join(f"- {descriptions.plain(v)}" for v in value)
                 )
         return "\n\n".join(parts) or "nothing was recorded"
-
-
-def _made(value: object, before: Pair | None) -> str:
-    """Return what a stage newly made, as a short text."""
-    if isinstance(value, Cloud):
-        return f"a cloud of {value.count:,} points, {Path(value.name).name}"
-    if not isinstance(value, Pair):
-        return "done"
-    if before is None:
-        return "both clouds in their work frames"
-    found = []
-    if value.target.bev is not None and value.target.bev is not before.target.bev:
-        found.append(f"rasters of {value.target.bev.grid.cell:g} m cells")
-    if value.matches is not None and value.matches is not before.matches:
-        found.append(f"{len(value.matches.score)} matches")
-    if value.tie_points is not None and value.tie_points is not before.tie_points:
-        found.append(
-            f"{len(value.tie_points.score)} tie points, {int(np.sum(value.tie_points.inlier))} agreeing"
-        )
-    if value.T_target_source is not None and value.T_target_source is not before.T_target_source:
-        found.append("a transform")
-    if value.verdict is not None and value.verdict is not before.verdict:
-        found.append(f"verdict {value.verdict.name}")
-    return ", ".join(found) or "done"
 
 
 def _bounds(xyz: Floats) -> Floats:

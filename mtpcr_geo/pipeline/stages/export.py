@@ -17,6 +17,7 @@ from mtpcr_geo.core.system import command_line, peak_memory_mb
 from mtpcr_geo.core.types import Pair, Side, Verdict
 from mtpcr_geo.core.wording import visible
 from mtpcr_geo.crs.chain import TransformChain
+from mtpcr_geo.export.recording.budget import DEFAULT_MB, LEAST_MB, Budget
 from mtpcr_geo.pipeline.options import OUTPUT_NAMES, Force
 from mtpcr_geo.pipeline.records import Written
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
@@ -348,10 +349,23 @@ class WriteTransform(EvidenceWriter):
         return self.options.format or by_name
 
 
+class RecordingOptions(FileOptions):
+    """Options of mtpcr.write_recording."""
+
+    size_mb: float = Field(
+        DEFAULT_MB,
+        ge=LEAST_MB,
+        description="size that the file may have, megabytes: points and pictures are thinned to it",
+    )
+
+
 class WriteRecording(EvidenceWriter):
     """Record the whole run for the rerun viewer, whatever this stage's place."""
 
-    type = "mtpcr.write_recording"
+    type: ClassVar[str] = "mtpcr.write_recording"
+
+    Options: ClassVar[OptionsModel] = RecordingOptions
+    options: RecordingOptions
 
     def writes(self) -> list[Path]:
         """Name the recording."""
@@ -363,10 +377,13 @@ class WriteRecording(EvidenceWriter):
             raise OptionError(f"{self.label}: a run keeps one recording; remove the second")
         from mtpcr_geo.export.recording.recorder import RerunRecorder
 
-        context.recorder = RerunRecorder(context.outputs.path(self.options.filename))
+        budget = Budget(self.options.size_mb)
+        context.recorder = RerunRecorder(context.outputs.path(self.options.filename), budget)
 
     def write(self, pair: Pair, context: RunContext) -> None:
-        """Do nothing here: the recorder is told of every stage as it ends."""
+        """Report what the recording leaves out; the recorder itself is told of every stage as it ends."""
+        points = len(pair.source.sample), len(pair.target.sample)
+        self.metadata |= Budget(self.options.size_mb).facts(*points)
 
 
 class WriteReport(EvidenceWriter):

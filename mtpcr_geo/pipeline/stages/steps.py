@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, get_args
 
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.export.recording.budget import DEFAULT_MB
 from mtpcr_geo.io.file_cloud import FileCloud
 from mtpcr_geo.io.formats import LAS_ENDINGS, files_at
 from mtpcr_geo.io.las import LasCloud
@@ -26,6 +27,7 @@ from mtpcr_geo.pipeline.stages.export import (
     BevFileOptions,
     FileOptions,
     ProjectFileOptions,
+    RecordingOptions,
     TransformFileOptions,
     WriteBev,
     WriteProject,
@@ -210,9 +212,10 @@ def readers_of(source: CloudLike, target: CloudLike, options: RegisterOptions) -
     ]
 
 
-def recording_writer(folder: Path) -> Stage:
-    """Make the stage that records the run into a folder."""
-    return WriteRecording(FileOptions(filename=folder / OUTPUT_NAMES["recording"]), "recording")
+def recording_writer(folder: Path, size_mb: float) -> Stage:
+    """Make the stage that records the run into a folder, in a file of at most so many megabytes."""
+    options = RecordingOptions(filename=folder / OUTPUT_NAMES["recording"], size_mb=size_mb)
+    return WriteRecording(options, "recording")
 
 
 def part_names(source: object) -> list[str]:
@@ -247,6 +250,7 @@ def writers_for(
         folder,
         force=options.force,
         recorded=options.recording,
+        recording_mb=options.recording_mb,
         recording=recording,
         parts=part_names(source),
         scale=options.scale,
@@ -259,6 +263,7 @@ def writers_of(
     *,
     force: bool,
     recorded: bool = False,
+    recording_mb: float = DEFAULT_MB,
     recording: Path | None = None,
     parts: Sequence[str] = (),
     scale: float | None = None,
@@ -270,6 +275,7 @@ def writers_of(
         folder: where the files go.
         force: write cloud, transform and the registered raster though the verdict withholds them.
         recorded: record the run.
+        recording_mb: size that the recording may have, megabytes.
         recording: a recording of it that is there already.
         parts: names of the files of a source of many; the moved ones are written under them.
         scale: storage step of the registered cloud; None chooses it.
@@ -285,7 +291,7 @@ def writers_of(
         options = TransformFileOptions(filename=where[tag], force=force)
         stages.append(WriteTransform(options, tag))
     if recorded:
-        stages.append(recording_writer(folder))
+        stages.append(recording_writer(folder, recording_mb))
     if recording is not None:
         stages.append(SavedRecording(recording, where["recording"], "recording"))
     return [
