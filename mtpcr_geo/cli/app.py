@@ -279,6 +279,8 @@ def _root(
 
 def main() -> None:
     """Run the command."""
+    # what fails in rerun's threads, as on a full disk, is an error of ours, told in one line
+    os.environ.setdefault("RUST_LOG", "off")
     signal.signal(signal.SIGTERM, _interrupt)
     app(prog_name=NAME)
 

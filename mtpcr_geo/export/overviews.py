@@ -68,7 +68,8 @@ def copy_with_overviews(
         creation: creation options of GDAL's COG driver.
 
     Raises:
-        rasterio.errors.RasterioError: if the file cannot be written.
+        rasterio.errors.RasterioError: if the file cannot be made.
+        OSError: if it cannot be written.
 
     """
     import rasterio
@@ -96,5 +97,7 @@ def copy_with_overviews(
                 ElementTree.SubElement(overview, "SourceFilename", relativeToVRT="0").text = name
                 ElementTree.SubElement(overview, "SourceBand").text = str(number)
         given = "FORCE_USE_EXISTING" if names else "NONE"
-        with MemoryFile(ElementTree.tostring(tree), ext=".vrt") as whole:
-            shutil.copy(whole.name, str(path), driver="COG", overviews=given, **creation)
+        with MemoryFile(ElementTree.tostring(tree), ext=".vrt") as whole, MemoryFile(ext=".tif") as packed:
+            shutil.copy(whole.name, packed.name, driver="COG", overviews=given, **creation)
+            # by Python, since GDAL prints what fails on a full disk instead of telling it
+            path.write_bytes(packed.getbuffer())
