@@ -230,11 +230,13 @@ def grid_around(bev: Bev, T_to_bev: Floats) -> Grid:
     rows = np.flatnonzero(filled.any(axis=1))
     if len(rows) == 0:
         return Grid(0.0, cell, cell, 1, 1)
-    # the ends of the rows bound all cells between them
+    # the ends of the rows, at the least and the greatest height of each, bound all cells between them
     first = filled[rows].argmax(axis=1)
     last = bev.grid.width - 1 - filled[rows, ::-1].argmax(axis=1)
     ends = np.column_stack([np.concatenate([first, last]), np.concatenate([rows, rows])])
-    xyz = np.column_stack([bev.grid.to_metres(ends.astype(np.float64)), bev.top[ends[:, 1], ends[:, 0]]])
+    plan = bev.grid.to_metres(ends.astype(np.float64))
+    heights = [np.fmin.reduce(bev.low[rows], axis=1), np.fmax.reduce(bev.top[rows], axis=1)]
+    xyz = np.concatenate([np.column_stack([plan, np.tile(height, 2)]) for height in heights])
     moved = transforms.apply(T_to_bev, xyz)[:, :2]
     low = np.floor(moved.min(axis=0) / cell - 0.5)
     high = np.ceil(moved.max(axis=0) / cell + 0.5)
@@ -246,7 +248,8 @@ def warp_bev(bev: Bev, T_to_bev: Floats, grid: Grid) -> Bev:
     """Resample a BEV to another grid under a 4x4 rigid transform that is mostly yaw and shift.
 
     Every cell of `grid` takes the nearest cell of `bev`; heights are moved exactly, and a small tilt
-    is allowed for by two fixed-point steps on the height of what is found.
+    is allowed for by two fixed-point steps on the height of what is found. Where they find nothing, as
+    between the lines of a thin scan, the cells of `bev` that come to lie there are taken.
 
     Args:
         bev: what to resample.
@@ -270,7 +273,31 @@ def warp_bev(bev: Bev, T_to_bev: Floats, grid: Grid) -> Bev:
         top[row, column] = _move_z(T_to_bev, xyz_bev, bev.top.ravel()[index])
         low[row, column] = _move_z(T_to_bev, xyz_bev, bev.low.ravel()[index])
         count[row, column] = bev.count.ravel()[index]
+    if _tilts(T_to_bev):
+        _add_missed(bev, filled, T_to_bev, Bev(grid, top, low, count))
     return Bev(grid, top, low, count)
+
+
+def _tilts(T: Floats) -> bool:
+    return bool(abs(T[2, 2]) < 1.0 - 1e-7)
+
+
+def _add_missed(bev: Bev, filled: Mask, T_to_bev: Floats, warped: Bev) -> None:
+    """Move cells of a BEV to where a 4x4 transform places them, into cells that are still empty."""
+    grid = warped.grid
+    row, column = np.nonzero(filled)
+    plan = bev.grid.to_metres(np.column_stack([column, row]).astype(np.float64))
+    z_top, z_low = bev.top[row, column], bev.low[row, column]
+    moved = transforms.apply(T_to_bev, np.column_stack([plan, z_top]))
+    to_column, to_row = grid.cells(moved)
+    fits = grid.holds(to_column, to_row)
+    fits[fits] = warped.count[to_row[fits], to_column[fits]] == 0
+    place = (to_row[fits], to_column[fits])
+    high = moved[fits, 2].astype(np.float32)
+    least = transforms.apply(T_to_bev, np.column_stack([plan[fits], z_low[fits]]))[:, 2].astype(np.float32)
+    for band, values, pick in ((warped.top, high, np.fmax), (warped.low, least, np.fmin)):
+        pick.at(band, place, values)
+    np.add.at(warped.count, place, bev.count[row[fits], column[fits]])
 
 
 def _source_cells(
@@ -279,8 +306,7 @@ def _source_cells(
     """Return the BEV's cell for each of (n, 2) places: found or not, (n, 3) place in the BEV, flat index."""
     T_bev_to = transforms.inverse(T_to_bev)
     z_to = np.full(len(plan), (T_to_bev @ np.array([0.0, 0.0, height, 1.0]))[2])
-    tilted = abs(T_to_bev[2, 2]) < 1.0 - 1e-7
-    for last in (False, False, True) if tilted else (True,):
+    for last in (False, False, True) if _tilts(T_to_bev) else (True,):
         xyz_bev = transforms.apply(T_bev_to, np.column_stack([plan, z_to]))
         pixel = np.rint(bev.grid.to_pixel(xyz_bev[:, :2])).astype(np.int64)
         inside = ((pixel >= 0) & (pixel < [bev.grid.width, bev.grid.height])).all(axis=1)

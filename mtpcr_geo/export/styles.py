@@ -65,8 +65,8 @@ def link_style(limits_m: tuple[float, float] = (0.1, 0.5), exaggeration: float =
 def footprint_style() -> list[Element]:
     """Return the style of footprints: outlines only, the source in orange and the target in blue."""
     rules = [
-        ("\"role\" = 'source'", "source, registered", [_fill(SOURCE, "solid")]),
-        ("\"role\" = 'target'", "target", [_fill(TARGET, "dash")]),
+        ("\"role\" = 'source'", "source, registered: convex outline", [_fill(SOURCE, "solid")]),
+        ("\"role\" = 'target'", "target: convex outline", [_fill(TARGET, "dash")]),
     ]
     return [_ruled("fill", rules)]
 

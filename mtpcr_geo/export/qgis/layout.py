@@ -34,7 +34,7 @@ _LEGEND_STYLES = (
 _CAPTIONS = {
     "Before": "Before: heights as they came",
     "After": "After: heights, the registered source over the target",
-    "Evidence": "Evidence: height difference, tie points, and their residuals in plan (arrows, longer)",
+    "Evidence": "Evidence: height difference, tie points, arrows of their plan residuals",
 }
 
 

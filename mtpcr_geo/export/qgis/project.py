@@ -134,11 +134,9 @@ def _groups(rasters: Mapping[str, LayerFile], tables: Mapping[str, MapLayer]) ->
         tables[name] for name in ("tie_points", "links", "hypotheses") if name in tables
     ]
     if "difference" in rasters:
-        if fixed is not None:
-            evidence.append(shade_layer(fixed, "evidence_target"))
-        title = "Height difference"
-        evidence += raster_layers(rasters["difference"], "difference", title, shaded=False)
-    elif fixed is not None and evidence:
+        evidence += raster_layers(rasters["difference"], "difference", "Height difference", shaded=False)
+    if fixed is not None and evidence:
+        # below the difference: shades of crowns say nothing of the ground
         evidence.append(shade_layer(fixed, "evidence_target"))
     if evidence:
         groups.append(Group(EVIDENCE, evidence, shown=False))
