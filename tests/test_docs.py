@@ -1,4 +1,4 @@
-"""What README and docs say: their examples run from top to bottom, their links lead somewhere, the site builds."""
+"""What README and docs show: examples run from top to bottom, links lead somewhere, the site builds."""
 
 from __future__ import annotations
 
