@@ -240,6 +240,7 @@ def test_hypotheses_are_the_middle_of_what_both_would_share(tmp_path):
     assert rows[0][2] == pytest.approx(SHIFT[0])
     place = np.array(struct.unpack("<3d", rows[0][3][-24:]))
     moved = transforms.apply(true_transform(), pair.source.sample)
+    assert pair.target.bev is not None
     column, row = np.rint(pair.target.bev.grid.to_pixel(moved[:, :2])).astype(int).T
     inside = (
         (column >= 0)

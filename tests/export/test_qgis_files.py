@@ -78,6 +78,8 @@ def test_a_large_raster_is_laid_out_from_coarse_to_fine(tmp_path):
 @pytest.mark.parametrize("tilt", [0.0, 0.1])
 def test_the_difference_is_registered_minus_target(tmp_path, tilt):
     pair = make_pair(60_000, tilt=tilt)
+    assert pair.T_target_source is not None
+    assert pair.target.bev is not None
     raised = pair.with_(T_target_source=transforms.translation((0.0, 0.0, 0.4)) @ pair.T_target_source)
     for one, expected in ((pair, 0.0), (raised, 0.4)):
         found = difference.height_difference(one)
@@ -107,6 +109,7 @@ def test_the_difference_is_registered_minus_target(tmp_path, tilt):
 
 def test_clouds_side_by_side_have_no_difference(tmp_path):
     pair = make_pair(3000)
+    assert pair.T_target_source is not None
     apart = pair.with_(T_target_source=transforms.translation((500.0, 0.0, 0.0)) @ pair.T_target_source)
     assert difference.height_difference(apart) is None
     out = saved(apart.with_(verdict=Verdict("accepted", ("fits",), {})), tmp_path / "out")
