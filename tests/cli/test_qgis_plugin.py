@@ -10,6 +10,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel
 from typer.testing import CliRunner
 
 from mtpcr_geo.cli import qgis_plugin
@@ -18,7 +19,7 @@ from mtpcr_geo.cli.options import ApplyVerb, CheckVerb, RegisterVerb
 from mtpcr_geo.core.version import __version__
 from mtpcr_geo.export.qgis.plugin import command
 
-MODELS = {"register": RegisterVerb, "apply": ApplyVerb, "check": CheckVerb}
+MODELS: dict[str, type[BaseModel]] = {"register": RegisterVerb, "apply": ApplyVerb, "check": CheckVerb}
 KINDS = {"switch", "choice", "number", "integer", "point", "file", "folder", "out_file", "out_folder", "text"}
 
 
