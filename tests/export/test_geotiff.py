@@ -239,16 +239,12 @@ def test_hypotheses_are_the_middle_of_what_both_would_share(tmp_path):
     assert rows[0][1] == pytest.approx(np.rad2deg(YAW))
     assert rows[0][2] == pytest.approx(SHIFT[0])
     place = np.array(struct.unpack("<3d", rows[0][3][-24:]))
+    bev = pair.target.bev
+    assert bev is not None
     moved = transforms.apply(true_transform(), pair.source.sample)
-    assert pair.target.bev is not None
-    column, row = np.rint(pair.target.bev.grid.to_pixel(moved[:, :2])).astype(int).T
-    inside = (
-        (column >= 0)
-        & (column < pair.target.bev.grid.width)
-        & (row >= 0)
-        & (row < pair.target.bev.grid.height)
-    )
-    inside[inside] = pair.target.bev.count[row[inside], column[inside]] > 0
+    column, row = np.rint(bev.grid.to_pixel(moved[:, :2])).astype(int).T
+    inside = (column >= 0) & (column < bev.grid.width) & (row >= 0) & (row < bev.grid.height)
+    inside[inside] = bev.count[row[inside], column[inside]] > 0
     expected = moved[inside].mean(axis=0) + ORIGIN
     assert 100 < inside.sum() < len(inside)
     assert np.allclose(place[:2], expected[:2], atol=1e-6)

@@ -185,12 +185,12 @@ def test_files_opened_alone(demo, tmp_path):
 
 @pytest.mark.parametrize("name", ["delft_urban_ahn3", "forest_plot_mls_uas", "robot_scans"])
 def test_projects_of_real_pairs(name, shared_data, tmp_path):
-    known: dict[str, dict[str, Any]] = {
+    every: dict[str, dict[str, Any]] = {
         "delft_urban_ahn3": {"source_crs": "EPSG:7415", "target_crs": "EPSG:7415"},
         "forest_plot_mls_uas": {"source_crs": "local"},
         "robot_scans": {"local": True},
     }
-    options = known[name]
+    options = every[name]
     pair = shared_data / name
     out = tmp_path / "out"
     register(pair / "source.laz", pair / "target.laz", out, recording=False, **options)

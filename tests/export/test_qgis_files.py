@@ -38,6 +38,12 @@ def run(tmp_path_factory) -> Path:
     return saved(make_pair(20_000), tmp_path_factory.mktemp("qgis") / "out")
 
 
+def moved_by(pair: Pair, *shift: float) -> Pair:
+    """Return a pair whose transform puts the source somewhere else, metres."""
+    assert pair.T_target_source is not None
+    return pair.with_(T_target_source=transforms.translation(np.array(shift)) @ pair.T_target_source)
+
+
 def project_of(out: Path) -> ElementTree.Element:
     with zipfile.ZipFile(out / "project.qgz") as archive:
         assert archive.namelist() == ["project.qgs"]
@@ -78,9 +84,7 @@ def test_a_large_raster_is_laid_out_from_coarse_to_fine(tmp_path):
 @pytest.mark.parametrize("tilt", [0.0, 0.1])
 def test_the_difference_is_registered_minus_target(tmp_path, tilt):
     pair = make_pair(60_000, tilt=tilt)
-    assert pair.T_target_source is not None
-    assert pair.target.bev is not None
-    raised = pair.with_(T_target_source=transforms.translation((0.0, 0.0, 0.4)) @ pair.T_target_source)
+    raised = moved_by(pair, 0.0, 0.0, 0.4)
     for one, expected in ((pair, 0.0), (raised, 0.4)):
         found = difference.height_difference(one)
         assert found is not None
@@ -102,6 +106,7 @@ def test_the_difference_is_registered_minus_target(tmp_path, tilt):
         xy = found.grid.to_metres(np.array([[column, row]], np.float64))
         values = []
         for bev in (moved, pair.target.bev):
+            assert bev is not None
             (c, r) = np.rint(bev.grid.to_pixel(xy)).astype(int)[0]
             values.append(float(bev.low[r, c]))
         assert found.low[row, column] == pytest.approx(values[0] - values[1], abs=1e-5)
@@ -109,8 +114,7 @@ def test_the_difference_is_registered_minus_target(tmp_path, tilt):
 
 def test_clouds_side_by_side_have_no_difference(tmp_path):
     pair = make_pair(3000)
-    assert pair.T_target_source is not None
-    apart = pair.with_(T_target_source=transforms.translation((500.0, 0.0, 0.0)) @ pair.T_target_source)
+    apart = moved_by(pair, 500.0, 0.0, 0.0)
     assert difference.height_difference(apart) is None
     out = saved(apart.with_(verdict=Verdict("accepted", ("fits",), {})), tmp_path / "out")
     assert not (out / "bev" / "difference.tif").exists()

@@ -168,7 +168,8 @@ def test_registration_that_finds_nothing_is_refused_with_evidence(town_files, tm
     assert result.verdict.name == "refused"
     assert "looks like" in result.verdict.reasons[0]
     written = {path.name for path in files_below(tmp_path)}
-    assert written == {"source.tif", "target.tif", "run.json", "report.html"}
+    styled = {"source.tif", "source.qml", "target.tif", "target.qml"}
+    assert written == styled | {"project.qgz", "run.json", "report.html"}
     assert result.T_target_source is None
 
 
