@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mtpcr_geo.core.wording import MOST_DECIMALS, beside, only, percent
+from mtpcr_geo.core.wording import MOST_DECIMALS, beside, only, percent, visible
 
 
 @pytest.mark.parametrize(
@@ -41,3 +41,8 @@ def test_shares_are_percent_and_few_are_only():
         "only 1 tie point",
         "only 2 tie points",
     ]
+
+
+def test_lines_are_escaped_one_by_one():
+    text = "plain\nwith \x1b[31m\n\u202e\n\nend\r"
+    assert visible(text) == "plain\nwith \\x1b[31m\n\\u202e\n\nend\\r"

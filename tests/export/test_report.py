@@ -150,7 +150,8 @@ def test_text_from_files_cannot_become_markup(tmp_path):
     assert "<script>alert" not in html
     assert html.count("&lt;script&gt;alert(1)&lt;x y=") > 15
     assert "<x" not in html
-    assert "49" not in re.sub('data:image[^"]*', "", html).partition("<main>")[2].partition("<svg")[0]
+    # and no template runs what they say
+    assert html.count("{{ 7 * 7 }}") == html.count("alert(1)")
     assert "&lt;b&gt;&amp;" in html
     assert "&lt;i&gt;" in html
     assert "<i>" not in html

@@ -8,6 +8,7 @@ import re
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -73,6 +74,37 @@ def recorded(pair: Pair, path: Path) -> str:
     return str(texts[-1])
 
 
+class Figure(NamedTuple):
+    """A figure of a report: as printed, as it claims to be, and whether it is printed as an upper bound."""
+
+    text: str
+    value: float
+    bound: bool
+
+
+def figures_of(html: str) -> dict[str, list[Figure]]:
+    """The figures of a report by the place in run.json that they name."""
+    found: dict[str, list[Figure]] = {}
+    pattern = r'<data value="([^"]*)" data-from="([^"]*)"( data-bound="yes")?>([^<]*)</data>'
+    for value, place, bound, text in re.findall(pattern, html):
+        found.setdefault(place, []).append(Figure(text, float(value), bool(bound)))
+    return found
+
+
+def assert_rounded(figure: Figure, value: float) -> None:
+    """What is printed is the figure, rounded to the digits printed; a bound is rounded up."""
+    (printed,) = re.findall(r"[-+]?[\d,]*\.?\d+(?:e[-+]?\d+)?", figure.text)[:1]
+    number = float(printed.replace(",", ""))
+    if figure.text.endswith("%"):
+        value = 100.0 * value
+    digits = len(printed.partition("e")[0].partition(".")[2])
+    step = 10.0**-digits * 10.0 ** int(printed.partition("e")[2] or 0)
+    if figure.bound:
+        assert value <= number <= value + step + 1e-12, figure
+    else:
+        assert abs(number - value) <= 0.5 * step + 1e-12 * abs(value), figure
+
+
 @pytest.mark.parametrize(("name", "force"), CASES)
 def test_every_place_says_the_same(name: str, force: bool, tmp_path: Path) -> None:
     pair = judged(name)
@@ -107,6 +139,41 @@ def test_every_place_says_the_same(name: str, force: bool, tmp_path: Path) -> No
         assert row in recording
     refusing = [one for one in run["checks"] if one["status"] == "not passed"]
     assert bool(refusing) == (name != "accepted")
+
+    # every figure of the report that stands in run.json too names its place there, and says the same
+    shown = figures_of(html)
+    assert {"metrics.ground_cells", "metrics.tie_points", "metrics.yaw_deg", "metrics.tilt_deg"} <= set(shown)
+    if name != "refused":
+        assert {"metrics.within_95_plan_m", "metrics.sigma_yaw_deg"} <= set(shown)
+    numbers = {key for key, value in run["metrics"].items() if type(value) in (int, float)}
+    assert {path for path in shown if path.startswith("metrics.")} == {f"metrics.{key}" for key in numbers}
+    for place, found in shown.items():
+        value = run
+        for key in place.split("."):
+            value = value[key]
+        for figure in found:
+            assert figure.value == value, place
+            assert_rounded(figure, value)
+
+    # what the terminal prints of the transform
+    ((yaw, tilt),) = set(re.findall(r"yaw\s+([-+][\d.]+)\D*?tilt\s+([\d.]+)", terminal))
+    assert_rounded(Figure(yaw, 0.0, False), run["metrics"]["yaw_deg"])
+    assert_rounded(Figure(tilt, 0.0, False), run["metrics"]["tilt_deg"])
+
+    # counts and measures within the checks are those of the metrics
+    check = {one["check"]: one["value"] for one in run["checks"]}
+    known = run["metrics"]
+    assert check["tie points"].startswith(
+        f"{known['held_out_tie_points']}, of which {known['held_out_agreeing']} agree when held out"
+    )
+    assert f"moved {known['refined_away_m']:.2f} m" in check["refinement"]
+    assert f" of {known['ground_cells']:,} cells" in check["ground heights"]
+    share = float(check["ground heights"].partition(" %")[0])
+    assert share == pytest.approx(100.0 * known["ground_agreeing"] / known["ground_cells"], abs=0.5)
+    assert float(check["next distinct pose"].split()[0]) == pytest.approx(
+        known["hypothesis_margin"], abs=5e-3
+    )
+    assert check["shared ground"].startswith(f"{known['overlap_m2']:.0f} m²")
 
     # the figures of the metrics, wherever they are printed
     for label, value in descriptions.metric_rows(verdict.metrics):

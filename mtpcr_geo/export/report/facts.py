@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from mtpcr_geo.crs import TransformChain
 from mtpcr_geo.export import descriptions
 from mtpcr_geo.export.transform import frames_of
 from mtpcr_geo.verdict.sentence import centimetres
+
+if TYPE_CHECKING:
+    from pyproj import CRS
 
 STATUS_CLASS = {"passed": "ok", "not passed": "bad", "warning": "warn", "not checked": "none"}
 _MOST_HYPOTHESES = 8
@@ -332,16 +335,27 @@ def frame_rows(pair: Pair) -> list[Row]:
     }
     if pair.source is pair.target:
         del names["source"]
-    return [row(name, _crs_text(frames[role])) for role, name in names.items()]
+    known = {
+        "source": pair.source.link.file_crs,
+        "target": pair.target.link.file_crs,
+        "result": (pair.frame.output or pair.target.link).file_crs,
+        "work": pair.frame.crs,
+    }
+    return [row(name, _crs_text(frames[role], known[role])) for role, name in names.items()]
 
 
-def _crs_text(frame: Mapping[str, Any]) -> str:
+def _crs_text(frame: Mapping[str, Any], crs: CRS | None) -> str:
     units = list(dict.fromkeys(frame["units"]))
     unit = units[0] if len(units) == 1 else f"{frame['units'][0]} in plan, {frame['units'][2]} in height"
     if frame["crs"] is None:
         return f"local coordinates, {unit}"
-    code = frame["crs"].get("authority")
-    return f"{frame['crs']['name']} ({code or 'no code'}), {unit}"
+    return f"{frame['crs']['name']} ({frame['crs']['authority'] or _codes_of_parts(crs)}), {unit}"
+
+
+def _codes_of_parts(crs: CRS | None) -> str:
+    """Return the codes of the parts of a compound CRS that has none of its own."""
+    codes = [part.to_authority() for part in crs.sub_crs_list] if crs is not None else []
+    return " + ".join(":".join(code) if code else "no code" for code in codes) or "no code"
 
 
 def provenance_rows(facts: Mapping[str, Any], when: str) -> list[Row]:

@@ -24,12 +24,14 @@ from mtpcr_geo.verdict.findings import rival_text
 MOST_RIVALS = 2
 BOTH_KEYS = (
     Key("#9a9a9a", "grey: equal heights"),
-    key(drawing.SOURCE_RGB, "source higher, or alone"),
-    key(drawing.TARGET_RGB, "target higher, or alone"),
+    key(drawing.SOURCE_RGB, "source higher"),
+    key(drawing.TARGET_RGB, "target higher"),
+    Key("#3a3a3a", "dim: seen by one alone"),
 )
 SIDE_KEYS = (key(drawing.SOURCE_RGB, "source"), key(drawing.TARGET_RGB, "target"))
 _GROUND_CSS, _OTHER_CSS = "#4c78a8", "#b9c6d3"
 _ERROR_POINTS = 200_000
+_FEWEST_GROUND = 100
 
 
 @dataclass(frozen=True)
@@ -49,19 +51,21 @@ class BeforeAfter:
     caption: str
 
 
-def overlap_zoom(overlay: Overlay, pose: str = "the pose found") -> Shown:
+def overlap_zoom(overlay: Overlay) -> Shown:
     """Show the part of the overlap in which one sees best whether both clouds fit."""
     picture, cell = overlay.zoom()
+    verdict = overlay.pair.verdict
+    refused = verdict is not None and verdict.name == "refused"
+    pose = "the pose that is refused" if refused else "the pose found"
     return shown(
         picture,
-        f"Heights of both clouds in a part of their overlap under {pose}: grey where they are equal, "
-        f"orange or "
-        "blue where one of them is higher.",
+        f"Heights of both clouds in a part of their overlap under {pose}: grey where they are equal, orange "
+        "or blue where one of them is higher.",
         cell=cell,
         keys=BOTH_KEYS,
-        caption="Heights of both clouds, light is high, where most stands in the overlap. Outlines that "
-        "are grey "
-        "lie on each other; a shift shows as an orange fringe on one side and a blue one on the other.",
+        caption=f"Heights of both clouds under {pose}, light is high, where most stands in the overlap. "
+        "Outlines that are grey lie on each other; a shift shows as an orange fringe on one side and a blue "
+        "one on the other.",
     )
 
 
@@ -95,14 +99,16 @@ def difference(overlay: Overlay) -> Difference | None:
     known = off[np.isfinite(off)].astype(np.float64)
     if not len(known):
         return None
-    most = pictures.difference_limit(known)
+    ground = -overlay.ground.step
+    most = pictures.difference_limit(ground if len(ground) >= _FEWEST_GROUND else known)
+    box = overlay.box
+    off = off[box.rows, box.columns]
     boxes = tuple(
-        _box(patch.window, off.shape, str(number)) for number, patch in enumerate(overlay.patches(), start=1)
+        _box(patch.window, box, str(number)) for number, patch in enumerate(overlay.patches(), start=1)
     )
     names = (f"below −{most:g} m", "equal", f"above {most:g} m")
     keys = tuple(Key(css, name) for css, name in zip(("#2166ac", "#f7f7f7", "#b2182b"), names, strict=True))
     picture = pictures.difference_colours(off, most)
-    ground = -overlay.ground.step
     image = shown(
         pictures.enlarged(picture, 900),
         f"Map of the height differences in the overlap, from {-most:g} m in blue to {most:g} m in red.",
@@ -258,7 +264,7 @@ def error_map(pair: Pair) -> Shown | None:
         exact=True,
         keys=(key(drawing.GOOD_RGB, f"{low:.2f} m"), key(drawing.BAD_RGB, f"{high:.2f} m")),
         caption="What 95 % of the errors in plan stay below, over the source's extent, in the target's "
-        "frame.",
+        "frame, at the median height of its points.",
     )
 
 
@@ -288,7 +294,10 @@ def expected_error_picture(
     column, row = grid.cells(level)
     row, column = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
     _, first = np.unique(row * width + column, return_index=True)
-    within, _ = uncertainty.within_95(moved[first])
+    # all at one height: the map shows how it grows with the distance, not what stands where
+    at = level[first]
+    at[:, 2] = np.median(level[:, 2])
+    within, _ = uncertainty.within_95(at @ uncertainty.R_level + uncertainty.pivot)
     least, most = float(within.min()), float(within.max())
     picture = np.zeros((height, width, 4), np.uint8)
     colours = drawing.residual_colours(within, least, max(most, least + 1e-9))
@@ -344,11 +353,13 @@ def matched(pair: Pair) -> Shown | None:
     )
 
 
-def _box(window: Window, shape: tuple[int, ...], text: str) -> Box:
-    height, width = shape
+def _box(window: Window, within: Window, text: str) -> Box:
+    """Return a window as a rectangle over the picture of another that holds it."""
+    height = within.rows.stop - within.rows.start
+    width = within.columns.stop - within.columns.start
     return Box(
-        round(100.0 * window.columns.start / width, 2),
-        round(100.0 * window.rows.start / height, 2),
+        round(100.0 * (window.columns.start - within.columns.start) / width, 2),
+        round(100.0 * (window.rows.start - within.rows.start) / height, 2),
         round(100.0 * (window.columns.stop - window.columns.start) / width, 2),
         round(100.0 * (window.rows.stop - window.rows.start) / height, 2),
         text,

@@ -105,6 +105,18 @@ class Overlay:
         return overlap_of(moved, self.pair.target.sample, ground_cell_for(self.pair.cell)).common_ground()
 
     @cached_property
+    def box(self) -> Window:
+        """The part of the grid that holds all that both see, and a little around it."""
+        rows, columns = np.flatnonzero(self.shared.any(axis=1)), np.flatnonzero(self.shared.any(axis=0))
+        around = max(1, round(0.03 * max(np.ptp(rows), np.ptp(columns))))
+        return Window(
+            *(
+                slice(max(int(part[0]) - around, 0), min(int(part[-1]) + 1 + around, size))
+                for part, size in zip((rows, columns), self.shared.shape, strict=True)
+            )
+        )
+
+    @cached_property
     def window(self) -> Window:
         """The part in which one sees best whether both fit."""
         return telling_window(*self.rasters)
@@ -143,22 +155,27 @@ class Overlay:
 def heights_of_both(source: Image, target: Image) -> drawing.Picture:
     """Return heights of both as (h, w, 4) RGBA, in two colours that add up to grey where they are equal.
 
-    A plane is taken off both. Where one of them alone is seen, its colour is dim.
+    A plane is taken off both. Where one of them alone is seen, it is dim and nearly grey.
 
     Args:
         source, target: (h, w) metres, NaN where empty.
 
     """
     low, high, plane = _stretch(source, target)
-    light = []
-    for top, other in ((source, target), (target, source)):
-        share = np.clip((top - plane - low) / (high - low), 0.0, 1.0)
-        share = np.where(np.isfinite(top), 0.12 + 0.88 * share, 0.0)
-        light.append(np.where(np.isfinite(other), share, _ALONE * share)[..., None])
+    seen = [np.isfinite(top) for top in (source, target)]
+    light = [
+        np.where(one, 0.12 + 0.88 * np.clip((top - plane - low) / (high - low), 0.0, 1.0), 0.0)[..., None]
+        for one, top in zip(seen, (source, target), strict=True)
+    ]
     orange = np.array(drawing.SOURCE_RGB, np.float64)
     orange *= 255.0 / orange.max()
-    mixed = light[0] * orange + light[1] * (255.0 - orange)
-    alpha = np.where(np.isfinite(source) | np.isfinite(target), 255, 0)
+    hues = orange, 255.0 - orange
+    mixed = light[0] * hues[0] + light[1] * hues[1]
+    for one, other, hue, share in ((*seen, hues[0], light[0]), (*seen[::-1], hues[1], light[1])):
+        # what one of them alone sees says nothing of the fit
+        dim = _ALONE * share * (0.75 * 255.0 + 0.25 * hue)
+        mixed = np.where((one & ~other)[..., None], 20.0 + dim, mixed)
+    alpha = np.where(seen[0] | seen[1], 255, 0)
     return np.dstack([np.clip(mixed, 0, 255), alpha]).astype(np.uint8)
 
 

@@ -15,6 +15,7 @@ from mtpcr_geo.export import drawing
 from mtpcr_geo.method.bev import coarsen
 
 _BLOCK_CELLS = 8
+_NEARLY = 0.15  # a few cells more may be empty before others are joined
 _FILLED_SHARE = 0.7
 _DENSE_SHARE = 0.85
 _LEAST_WEIGHT = 0.02
@@ -42,7 +43,7 @@ def joined_cells(bev: Bev, share: float = _FILLED_SHARE, most_cells: int = 4096)
     # by Poisson's law for points spread at random
     per_cell = -math.log1p(-min(max(filled, 1e-4), 1.0 - 1e-4))
     to_fill = math.sqrt(-math.log1p(-share) / per_cell)
-    return max(1, round(to_fill), -(-max(bev.grid.shape) // most_cells))
+    return max(1, math.ceil(to_fill - _NEARLY), -(-max(bev.grid.shape) // most_cells))
 
 
 def closed(top: Image) -> Image:
