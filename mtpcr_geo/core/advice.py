@@ -20,11 +20,11 @@ R = TypeVar("R")
 Spelling = Callable[[str, str], str]
 """Takes the name of an option, as in Python, and its value, "" where none is named; returns its writing."""
 
-SWITCHES = frozenset({"local", "force", "overwrite", "allow_code", "allow_network", "no_prior"})
+SWITCHES = frozenset({"local", "force", "overwrite", "allow_code", "allow_network", "inverse", "no_prior"})
 """Options that are on or off, of those that messages name."""
 
 _NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
-_VALUE = rf"EPSG:(?:\.\.\.|\d+)|local(?![\w-])|georef(?!\w)|{_NUMBER}|(?:mm|cm|ft|us-ft)(?!\w)|[XY](?!\w)"
+_VALUE = rf"EPSG:(?:\.\.\.|\d+)|local(?![\w-])|(?:georef|paper|mm|cm|ft|us-ft)(?!\w)|{_NUMBER}|[XY](?!\w)"
 _OPTION = re.compile(rf"(?<![\w-])--([a-z]+(?:-[a-z]+)*)(?![\w.=-])((?: (?:{_VALUE}))*)")
 
 _in_command: ContextVar[bool] = ContextVar("in_command", default=False)
@@ -79,6 +79,8 @@ def spelt(text: str, spelling: Spelling) -> str:
 
 def as_keyword(name: str, value: str) -> str:
     """Return an option as a keyword of Python; its name alone where no value is known."""
+    if name.startswith("no_") and name not in SWITCHES:
+        return f"{name.removeprefix('no_')}=False"
     if name in SWITCHES:
         return f"{name}=True{' ' + value if value else ''}"
     return f"{name}={as_value(value)}" if value else name

@@ -75,7 +75,8 @@ def test_a_changed_input_is_found_by_its_hash_and_not_run(copy):
     assert quiet.stderr.count("\n") == 1
 
 
-def test_a_changed_option_is_found(copy):
+@pytest.mark.slow
+def test_a_changed_option_is_found_and_changes_the_result(copy):
     path = copy / "out" / "run.json"
     record = json.loads(path.read_text())
     pipeline = [one | ({"cell": 2.5} if one["type"] == "mtpcr.bev" else {}) for one in record["pipeline"]]
@@ -85,14 +86,21 @@ def test_a_changed_option_is_found(copy):
     assert ("option", "bev.cell") in kinds(found)
     assert ("file", "audit.rrd") in kinds(found)
     assert ("transform", "T_target_source") in kinds(found)
-    # changed in both places of run.json, the recording still knows
-    change(path, options=record["options"] | {"bev": record["options"]["bev"] | {"cell": 2.5}})
+
+
+def test_the_recording_knows_of_an_option_changed_throughout_the_record(copy):
+    path = copy / "out" / "run.json"
+    record = json.loads(path.read_text())
+    pipeline = [one | ({"cell": 2.5} if one["type"] == "mtpcr.bev" else {}) for one in record["pipeline"]]
+    options = record["options"] | {"bev": record["options"]["bev"] | {"cell": 2.5}}
+    change(path, pipeline=pipeline, options=options)
     (copy / "source.laz").write_bytes(b"")
     code, found = verify(copy / "out")
     assert code == EXIT_DIFFERENT
     assert ("option", "bev.cell") in kinds(found)
 
 
+@pytest.mark.slow
 def test_other_versions_are_named_and_do_not_count_alone(copy):
     (copy / "out" / "audit.rrd").unlink()
     path = copy / "out" / "run.json"
