@@ -20,6 +20,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.advice import python_words
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import MissingPartError, OptionError, RegistrationError
 from mtpcr_geo.core.progress import Progress
@@ -199,6 +200,7 @@ class Registration:
         names = " to ".join(Path(side.cloud.name).name for side in (self.pair.source, self.pair.target))
         return registration_figure(self.pair, f"{names}: {self.verdict.name}")
 
+    @python_words
     def save(
         self,
         folder: str | os.PathLike[str],
@@ -279,6 +281,7 @@ class Registration:
         return TransformChain.of(cast(Pair, self.pair)) if solved else None
 
 
+@python_words
 def register(
     source: CloudLike,
     target: CloudLike,
@@ -337,6 +340,7 @@ def register(
     return Registration(result, chosen, recording=folder / OUTPUT_NAMES["recording"])
 
 
+@python_words
 def apply(
     transform: Registration | str | os.PathLike[str],
     points: CloudLike,

@@ -14,6 +14,7 @@ from mtpcr_geo.check import fitness, header, pair, place, points, upright
 from mtpcr_geo.check.describe import CloudFacts, describe
 from mtpcr_geo.check.findings import CloudRole, Finding, Role, by_severity, finding_of
 from mtpcr_geo.check.inspection import Inspection
+from mtpcr_geo.core.advice import python_words
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError, InputError, MtpcrError, OptionError, RegistrationError
 from mtpcr_geo.core.frames import box_points
@@ -97,6 +98,7 @@ def _frame_of(inspection: Inspection, declared: str | None, local: bool) -> Fram
     return link
 
 
+@python_words
 def check_clouds(
     source: str | Path,
     target: str | Path | None = None,

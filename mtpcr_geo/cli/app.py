@@ -20,6 +20,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 import mtpcr_geo
+from mtpcr_geo.core.advice import in_command
 from mtpcr_geo.core.errors import EXIT_DEFECT, EXIT_INTERRUPTED, MtpcrError, OptionError, one_line
 from mtpcr_geo.core.suggestions import meant
 
@@ -182,7 +183,7 @@ class Group(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the verb."""
-        with _errors_in_one_line():
+        with _errors_in_one_line(), in_command():
             return super().invoke(ctx)
 
 

@@ -167,7 +167,7 @@ def _summary(truth: Truth, registration: Registration, errors: Errors | None, fo
     if "registered" in written:
         lines.append(f"Open in QGIS: {written['registered']} over {folder / AERIAL}")
     if "recording" in written:
-        lines.append(f"Replay the run: rerun {written['recording']}")
+        lines.append(f"Replay the run: mtpcr-geo review {folder / RESULT}")
     if "report" in written:
         lines.append(f"Read: {written['report']}")
     return "\n".join(lines)

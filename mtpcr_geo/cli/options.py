@@ -94,6 +94,11 @@ class PipelineVerb(VerbOptions):
         Shown(INPUTS, argument=True),
     ] = None
     more: tuple[str, ...] = ()
+    input: Annotated[
+        Path | None,
+        Field(description="the pipeline JSON, named as pdal pipeline does"),
+        Shown(INPUTS, ("--input", "-i")),
+    ] = None
     only_validate: Annotated[
         bool,
         Field(description="check grammar, options, files and CRS; run nothing"),

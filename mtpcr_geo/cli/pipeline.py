@@ -11,6 +11,7 @@ import typer
 from mtpcr_geo.cli.options import PipelineVerb
 from mtpcr_geo.cli.parameters import command_of, shown_fields, spelling
 from mtpcr_geo.cli.shared import end_with, json_text, progress_bars
+from mtpcr_geo.core.advice import advising
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.suggestions import meant, suggestions
 
@@ -26,7 +27,7 @@ def run(options: PipelineVerb) -> None:
     relative to the current folder.
 
     Examples:
-        mtpcr-geo pipeline pipelines/register.json --validate
+        mtpcr-geo pipeline pipelines/ground_to_aerial.json --validate
         mtpcr-geo pipeline mine.json --readers.las.filename=a.laz --overwrite
         mtpcr-geo register a.laz b.laz -o out --dump-pipeline | mtpcr-geo pipeline -
 
@@ -61,11 +62,13 @@ def run_pipeline(options: PipelineVerb, progress: Progress) -> RunResult | None:
 
     """
     # an unknown option may stand where the file is expected
-    file, overrides = split_arguments([*([str(options.file)] if options.file else []), *options.more])
+    named = [str(one) for one in (options.input, options.file) if one is not None]
+    file, overrides = split_arguments([*named, *options.more])
     if file is None:
         raise OptionError("name a pipeline file, or - for standard input")
     from mtpcr_geo.io.outputs import OutputSet
     from mtpcr_geo.pipeline import grammar
+    from mtpcr_geo.pipeline.advice import for_command
     from mtpcr_geo.pipeline.api import metadata_of, read_text
     from mtpcr_geo.pipeline.runner import Settings, execute, validate
 
@@ -75,10 +78,12 @@ def run_pipeline(options: PipelineVerb, progress: Progress) -> RunResult | None:
     settings = Settings(
         overwrite=options.overwrite, allow_code=options.allow_code, allow_network=options.allow_network
     )
+    advised = advising(for_command(elements), command=True)
     if options.only_validate:
-        validate(specs, settings)
+        with advised:
+            validate(specs, settings)
         return None
-    with OutputSet(options.overwrite) as outputs:
+    with advised, OutputSet(options.overwrite) as outputs:
         read = [grammar.file_of(spec.options) for spec in specs if spec.type.startswith("readers.")]
         outputs.keep(Path(name) for name in (file, *read) if name)
         part = outputs.path(options.metadata) if options.metadata else None

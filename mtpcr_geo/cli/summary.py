@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.wording import visible
+from mtpcr_geo.verdict.findings import chance_text
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from mtpcr_geo.core.types import Verdict
     from mtpcr_geo.pipeline.records import StageRecord
     from mtpcr_geo.pipeline.runner import RunResult
     from mtpcr_geo.registration import Registration
@@ -20,28 +24,27 @@ if TYPE_CHECKING:
 _COLOUR = {"accepted": "bold green", "doubtful": "bold yellow", "refused": "bold red"}
 _RESULT_FILES = {"registered": "the registered cloud", "transform": "the transform"}
 # metrics of the verdict shown without --verbose
-_SHOWN = (
-    "vertical_offset_m",
+_SHOWN = ("vertical_offset_m", "held_out_median_m", "sigma_yaw_deg", "sigma_tilt_deg")
+# and these where the reasons do not say them: what was accepted names them as its grounds
+_SHOWN_UNLESS_ACCEPTED = (
     "overlap_m2",
     "overlap_source",
     "overlap_target",
     "held_out_agreeing_share",
-    "held_out_median_m",
     "hypothesis_margin",
-    "sigma_plan_m",
-    "sigma_height_m",
-    "sigma_yaw_deg",
-    "sigma_tilt_deg",
 )
 _OPEN_WITH = {
     "registered": "the moved cloud",
     "registered_also": "the moved cloud, for other programs",
+    "transform": "the transform, for mtpcr-geo apply; beside it for CloudCompare and PDAL",
     "report": "the report, in any browser",
-    "recording": "the recording, with: rerun",
+    "recording": "the recording, with: mtpcr-geo review",
     "project": "before, after and evidence on a map, in QGIS",
     "tie_points": "tie points and footprints, in QGIS",
     "run": "everything as numbers",
 }
+# outputs that are named by their folder, by how their names begin
+_OPEN_FOLDERS = {"bev_": "height rasters, in QGIS"}
 
 
 def print_registration(
@@ -69,17 +72,17 @@ def print_registration(
     name = result.verdict.name
     head, _, rest = result.verdict.headline.partition(":")
     console.print(Text.assemble((f"{head}:", _COLOUR[name]), rest), soft_wrap=True)
-    for reason in result.verdict.reasons:
+    for reason in _unsaid(result.verdict):
         console.print(Text(visible(f"  {reason}")), soft_wrap=True)
     facts = Table(box=None, show_header=False, pad_edge=True, padding=(0, 1))
-    for label, value in (*_transform_rows(result), *_metric_rows(result.verdict.metrics, verbose)):
+    for label, value in (*_transform_rows(result), *_metric_rows(result.verdict, verbose)):
         facts.add_row(Text(visible(label)), Text(visible(value)))
     if facts.row_count:
         console.print(facts)
     if verbose:
         _print_stages(result.report)
-    for path, what in _to_open(result).items() if files else ():
-        console.print(Text(visible(f"  {path}")), Text(what, "dim"), soft_wrap=True)
+    for one in _to_open(result) if files else ():
+        console.print(Text(visible(f"  {one.name}")), Text(one.what, "dim"), soft_wrap=True)
     for line in (*_withheld_lines(result, force_with), *_left_out_lines(result)):
         console.print(Text(visible(f"  {line}"), "dim"), soft_wrap=True)
 
@@ -94,7 +97,7 @@ def print_run(result: RunResult, *, verbose: bool = False, console: Console | No
         registration = registration_of(result)
         force_with = "force of mtpcr.apply and mtpcr.write_transform writes it all the same"
         print_registration(registration, verbose=verbose, console=console, force_with=force_with)
-        named = set(_to_open(registration))
+        named = {path for one in _to_open(registration) for path in one.files}
     elif verbose:
         _print_stages(result.done)
     for path in result.outputs:
@@ -138,9 +141,40 @@ def _stdout() -> Console:
     return Console(highlight=False)
 
 
-def _to_open(result: Registration) -> dict[Path, str]:
-    """Return the files worth opening, and what each is."""
-    return {path: _OPEN_WITH[key] for key, path in result.outputs.items() if key in _OPEN_WITH}
+@dataclass(frozen=True)
+class _Named:
+    """What is named of the files of a run: a file, or a folder of several.
+
+    Attributes:
+        name: as it is printed.
+        what: what it is.
+        files: the files that are named by it.
+
+    """
+
+    name: str
+    what: str
+    files: tuple[Path, ...]
+
+
+def _to_open(result: Registration) -> list[_Named]:
+    """Return the files worth opening, in the order of the table above, then the folders."""
+    outputs = result.outputs
+    found = [
+        _Named(str(outputs[key]), what, (outputs[key],)) for key, what in _OPEN_WITH.items() if key in outputs
+    ]
+    for start, what in _OPEN_FOLDERS.items():
+        files = tuple(path for key, path in outputs.items() if key.startswith(start))
+        if files:
+            found.append(_Named(os.path.join(files[0].parent, ""), what, files))
+    return found
+
+
+def _unsaid(verdict: Verdict) -> list[str]:
+    """Return the reasons that the headline does not give already."""
+    chance = verdict.metrics.get("probability")
+    said = {f"the pose is right with {chance_text(chance)}"} if chance is not None else set()
+    return [one for one in verdict.reasons if one not in verdict.headline and one not in said]
 
 
 def _transform_rows(result: Registration) -> list[tuple[str, str]]:
@@ -159,10 +193,12 @@ def _transform_rows(result: Registration) -> list[tuple[str, str]]:
     return [*rows, ("result in", result_text(pair))]
 
 
-def _metric_rows(metrics: Mapping[str, Any], verbose: bool) -> list[tuple[str, str]]:
+def _metric_rows(verdict: Verdict, verbose: bool) -> list[tuple[str, str]]:
     from mtpcr_geo.export.descriptions import metric_rows
 
-    chosen = {key: metrics[key] for key in _SHOWN if metrics.get(key) is not None}
+    metrics = verdict.metrics
+    shown = (*_SHOWN, *(_SHOWN_UNLESS_ACCEPTED if verdict.name != "accepted" else ()))
+    chosen = {key: metrics[key] for key in shown if metrics.get(key) is not None}
     return metric_rows(metrics if verbose or not chosen else chosen)
 
 

@@ -43,6 +43,7 @@ class RichProgress:
         self._bars = progress.Progress(
             progress.TextColumn("{task.description}", markup=False),
             progress.BarColumn(),
+            progress.TaskProgressColumn(),
             progress.TimeElapsedColumn(),
             console=console,
             transient=True,

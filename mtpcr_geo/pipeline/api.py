@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mtpcr_geo.core.advice import advising
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import InputError, OptionError
 from mtpcr_geo.core.paths import read_whole
 from mtpcr_geo.core.progress import Progress
 from mtpcr_geo.io.memory import cloud_of
 from mtpcr_geo.pipeline import grammar
+from mtpcr_geo.pipeline.advice import for_python
 from mtpcr_geo.pipeline.runner import RunResult, Settings, execute, validate
 from mtpcr_geo.pipeline.stage import Value
 from mtpcr_geo.pipeline.stages.memory import MemoryReader
@@ -122,7 +124,8 @@ class Pipeline:
             MtpcrError: the first thing found.
 
         """
-        validate(self._specs, self._settings, self._given)
+        with advising(for_python(self._elements)):
+            validate(self._specs, self._settings, self._given)
 
     def execute(self) -> int:
         """Run the pipeline, and return the number of points that came out at its end.
@@ -131,7 +134,8 @@ class Pipeline:
             MtpcrError: whatever stopped it; no output is left then.
 
         """
-        self._result = execute(self._specs, self._settings, self._progress, self._given)
+        with advising(for_python(self._elements)):
+            self._result = execute(self._specs, self._settings, self._progress, self._given)
         return sum(cloud.count for cloud in self._last())
 
     @property

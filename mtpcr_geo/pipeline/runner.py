@@ -178,10 +178,15 @@ def run(
             for stage in stages:
                 stage.open(context)
             context.recorder.begin(context.facts.audit())
-            for node in sorted(nodes, key=lambda node: node.stage.late):
-                if node.stage.late:
-                    context.stop_recording()
-                values[node.tag] = _turn(node.stage, [values[tag] for tag in inputs[node.tag]], context)
+            with context.progress.task(f"{len(nodes)} stages", len(nodes)) as advance:
+                for number, node in enumerate(sorted(nodes, key=lambda node: node.stage.late), start=1):
+                    if node.stage.late:
+                        context.stop_recording()
+                    with context.progress.task(f"{number} of {len(nodes)}: {node.tag}"):
+                        values[node.tag] = _turn(
+                            node.stage, [values[tag] for tag in inputs[node.tag]], context
+                        )
+                    advance(1)
         # a run that fails and keeps no evidence leaves nothing
         keep = context.failure is None or any(stage.evidence for stage in stages)
         # what an earlier run left under these names never stands beside this one's verdict

@@ -99,7 +99,7 @@ def test_names_reach_no_recording(tmp_path):
     from rerun.chunk import RrdReader
 
     pair = make_pair()
-    recorder = RerunRecorder(tmp_path / "a.rrd", Budget(0.5))
+    recorder = RerunRecorder(tmp_path / "a.rrd", Budget(1.0))
     facts = {"pipeline": [{"type": HOSTILE, "tag": HOSTILE, "filename": HOSTILE}], "versions": {},
              "inputs": [{"path": HOSTILE, "bytes": 1, "sha256": HOSTILE}], "started": 1.0}  # fmt: skip
     recorder.begin(facts)

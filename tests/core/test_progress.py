@@ -17,6 +17,7 @@ def test_bars_only_on_a_terminal(terminal):
         with progress.task("and something of unknown length") as step:
             step(1)
     assert ("reading" in text.getvalue()) == terminal
+    assert ("40%" in text.getvalue()) == terminal
 
 
 def test_no_progress_takes_the_same_calls():

@@ -325,10 +325,11 @@ def test_focus_matches_again_where_overlap_is_small():
 
     logged: list[str] = []
 
-    def note(path: str, what: object) -> None:
+    def note(path: str, what: object) -> float:
         logged.append(path)
+        return 1.0
 
-    pen = Pen(note, note, note, Budget())
+    pen = Pen(lambda path, what: logged.append(path), note, lambda path, shown: None, Budget())
     log_focus(pen, pair.with_(matches=forced))
     assert logged == ["focus/before/image", "focus/before/lines", "focus/after/image", "focus/after/lines"]
     # still on the pixels of the rasters given

@@ -61,7 +61,7 @@ def recorded(pair: Pair, path: Path) -> str:
     """The summary that a recording begins with, as the viewer gets it."""
     from rerun.chunk import RrdReader
 
-    writer = RecordingWriter(path, Budget(0.5), 0)
+    writer = RecordingWriter(path, Budget(1.0), 0)
     writer.begin({})
     writer.after("mtpcr.assess", "assess", {}, pair, 0.1)
     writer.close()

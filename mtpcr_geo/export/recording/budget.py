@@ -10,13 +10,15 @@ import numpy as np
 from mtpcr_geo.core.arrays import Floats
 
 DEFAULT_MB = 5.0
-LEAST_MB = 0.5
+LEAST_MB = 1.0
 _MEGABYTE = 1_000_000
+# texts, matches, tie points and the layout
+_FIXED_BYTES = 150_000
 # a position is 12 bytes, a colour 4: both as good as incompressible
 _POINT_BYTES = 16.0
 # of the whole, for the points of each view of one cloud; the rest is for pictures, matches and texts
-_SHARES: Mapping[str, float] = {"aligned": 0.17, "input": 0.06, "levelled": 0.05}
-_HEIGHT_SHARE = 0.05
+_SHARES: Mapping[str, float] = {"aligned": 0.15, "input": 0.055, "levelled": 0.045}
+_HEIGHT_SHARE, _PICTURE_SHARE = 0.05, 0.025
 _PICTURE_SIDE, _LEAST_SIDE, _MOST_SIDE = 1024, 128, 4096
 _KEYPOINTS = 4_000
 _AGAIN = 4
@@ -41,8 +43,12 @@ class Budget:
             times: how often that view of the cloud was recorded before; a repetition gets a quarter.
 
         """
-        most = self.size_mb * _MEGABYTE * _SHARES[view] / _POINT_BYTES
+        most = self._free_bytes * _SHARES[view] / _POINT_BYTES
         return max(int(most / (_AGAIN if times else 1)), 100)
+
+    @property
+    def _free_bytes(self) -> float:
+        return max(self.size_mb * _MEGABYTE - _FIXED_BYTES, 0.0)
 
     @property
     def picture_side(self) -> int:
@@ -50,9 +56,14 @@ class Budget:
         return int(np.clip(_PICTURE_SIDE * np.sqrt(self.size_mb / DEFAULT_MB), _LEAST_SIDE, _MOST_SIDE))
 
     @property
+    def picture_bytes(self) -> int:
+        """Size of an encoded picture."""
+        return int(self._free_bytes * _PICTURE_SHARE)
+
+    @property
     def height_side(self) -> int:
         """Longer side of a raster of heights, cells of 4 bytes."""
-        side = np.sqrt(self.size_mb * _MEGABYTE * _HEIGHT_SHARE / 4.0)
+        side = np.sqrt(self._free_bytes * _HEIGHT_SHARE / 4.0)
         return int(np.clip(side, _LEAST_SIDE, _MOST_SIDE))
 
     @property
@@ -117,5 +128,6 @@ def _some(number: int, most: int, seed: int) -> np.ndarray[tuple[int], np.dtype[
     """Return `most` of so many places: one from each of as many equal runs, not on a beat."""
     if number <= most:
         return np.arange(number)
+    starts = np.arange(most + 1) * number // most
     jitter = np.random.default_rng(seed).random(most)
-    return ((np.arange(most) + jitter) * (number / most)).astype(np.int64)
+    return starts[:-1] + (jitter * np.diff(starts)).astype(np.int64)

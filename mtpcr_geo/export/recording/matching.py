@@ -23,14 +23,14 @@ class Pen:
 
     Attributes:
         log: logs something under an entity path.
-        image: logs a picture under an entity path, shrunk to the budget's longest side.
+        image: logs a picture under an entity path, shrunk to the budget; returns by how much.
         bars: logs labelled bars under an entity path.
         budget: how much may be logged.
 
     """
 
     log: Callable[[str, Any], None]
-    image: Callable[[str, drawing.Picture], None]
+    image: Callable[[str, drawing.Picture], float]
     bars: Callable[[str, Sequence[bars.Bar]], None]
     budget: Budget
 
@@ -55,8 +55,7 @@ def log_keypoints(pen: Pen, pair: Pair) -> None:
         if found is None or side.appearance is None:
             continue
         root = f"keypoints/{side.role}"
-        pen.image(f"{root}/image", side.appearance.image)
-        scale = min(1.0, pen.budget.picture_side / max(side.appearance.image.shape))
+        scale = pen.image(f"{root}/image", side.appearance.image)
         for name, px, rgb, radius in (
             ("all", found, _KEYPOINT_RGB, 1.5),
             ("matched", used, drawing.UNJUDGED_RGB, 3.0),
@@ -92,7 +91,6 @@ def log_focus(pen: Pen, pair: Pair) -> None:
     for name, one in (("before", matches.before_focus), ("after", matches)):
         bare = pair.with_(matches=one, tie_points=None, T_target_source=None)
         picture, ends, colours, _ = drawing.match_lines(bare)
-        pen.image(f"focus/{name}/image", picture)
-        at: Floats = (ends + 0.5) * min(1.0, pen.budget.picture_side / max(picture.shape[:2]))
+        at: Floats = (ends + 0.5) * pen.image(f"focus/{name}/image", picture)
         lines = rr.LineStrips2D(at, colors=colours, radii=rr.Radius.ui_points(0.8), draw_order=20.0)
         pen.log(f"focus/{name}/lines", lines)

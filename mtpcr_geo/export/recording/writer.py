@@ -26,6 +26,7 @@ from mtpcr_geo.export.tie_points import footprints, tie_positions
 APPLICATION = "mtpcr_geo"
 _ROLE_RGB = {"source": drawing.SOURCE_RGB, "target": drawing.TARGET_RGB}
 _SHOWN_S = 0.05
+_SMALLEST_PICTURE, _LARGEST_STEP = 64, 0.9
 _KINDS = ("disagreeing", "agreeing", "held_out", "unjudged")
 
 
@@ -205,9 +206,9 @@ class RecordingWriter:
         if pair.source.bev is None or pair.target.bev is None:
             return
         picture, ends, colours, kind = drawing.match_lines(pair)
-        scale = min(1.0, self.budget.picture_side / max(picture.shape[:2]))
         if self._new("matches picture", (pair.source.bev, pair.target.bev)):
             self._log_image("matches/image", picture)
+        scale = self._recorded.images["matches/image"][0] / picture.shape[1]
         self._recorded.images["matches"] = self._recorded.images["matches/image"]
         ends = (ends + 0.5) * scale  # rerun's pixels have their centres at halves
         for number, name in enumerate(_KINDS):
@@ -301,10 +302,18 @@ class RecordingWriter:
                 bounds = np.array([np.minimum(known[0], bounds[0]), np.maximum(known[1], bounds[1])])
             self._recorded.bounds[root] = bounds
 
-    def _log_image(self, path: str, picture: drawing.Picture) -> None:
-        picture = drawing.fit(picture, self.budget.picture_side)
-        self._recorded.images[path] = (picture.shape[1], picture.shape[0])
-        self._log(path, rr.EncodedImage(contents=drawing.jpeg(picture), media_type="image/jpeg"))
+    def _log_image(self, path: str, picture: drawing.Picture) -> float:
+        """Log a picture as large as the budget allows, and return by how much it was shrunk."""
+        most = self.budget.picture_bytes
+        small = drawing.fit(picture, self.budget.picture_side)
+        data = drawing.jpeg(small)
+        while len(data) > most and max(small.shape[:2]) > _SMALLEST_PICTURE:
+            share = min(float(np.sqrt(most / len(data))), _LARGEST_STEP)
+            small = drawing.fit(picture, int(max(small.shape[:2]) * share))
+            data = drawing.jpeg(small)
+        self._recorded.images[path] = (small.shape[1], small.shape[0])
+        self._log(path, rr.EncodedImage(contents=data, media_type="image/jpeg"))
+        return float(small.shape[1] / picture.shape[1])
 
     def _log_bars(self, path: str, shown: Sequence[bars.Bar]) -> None:
         if shown:

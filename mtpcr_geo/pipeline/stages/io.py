@@ -396,6 +396,12 @@ def stated_crs(stage: Stage, option: str, text: str | None) -> CRS | None:
     if text is None:
         return None
     try:
-        return parse_crs(text)
+        crs = parse_crs(text)
     except CrsError as error:
         raise CrsError(f"{stage.label}: option {option!r}: {error}") from error
+    if crs is None:
+        raise CrsError(
+            f"{stage.label}: option {option!r} takes a coordinate reference system, and {text!r} is none; "
+            "that a cloud is local is said to the stage that takes both: --source-crs local, or --target-crs"
+        )
+    return crs
