@@ -2,7 +2,8 @@
 
     mtpcr-geo demo --overwrite && python docs/make_pictures.py mtpcr-demo
 
-Needs matplotlib and pyogrio (extra `test`). Without Chromium the picture of the report stays as it is.
+Needs matplotlib and pyogrio (extra `test`). Without Chromium the picture of the report stays as it is. A
+picture taken in QGIS, of any size, takes the place of the layers drawn here with ``--qgis PICTURE``.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ from PIL import Image
 IMAGES = Path(__file__).parent / "images"
 SOURCE, TARGET = "#e4572e", "#3b3f46"
 CELL_M = 0.6
+WIDTHS = (1100, 900, 720, 600, 480)
+LARGEST_BYTES = 150_000
 
 
 def heights(
@@ -151,17 +154,19 @@ def main() -> None:
     """Make every picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("demo", type=Path, help="folder of mtpcr-geo demo")
+    parser.add_argument("--qgis", type=Path, help="picture taken in QGIS, for the layers")
     parser.add_argument("--images", type=Path, default=IMAGES)
     arguments = parser.parse_args()
     arguments.images.mkdir(parents=True, exist_ok=True)
-    for name, figure in (
-        ("before_after", before_after(arguments.demo)),
-        ("layers", layers(arguments.demo / "result")),
-    ):
-        path = arguments.images / f"{name}.png"
-        figure.savefig(path)
-        # few colours tell the same
-        smaller(path)
+    picture = arguments.images / "before_after.png"
+    before_after(arguments.demo).savefig(picture)
+    smaller(picture)
+    picture = arguments.images / "layers.png"
+    if arguments.qgis:
+        shutil.copyfile(arguments.qgis, picture)
+    else:
+        layers(arguments.demo / "result").savefig(picture)
+    smaller(picture)
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     if chromium:
         picture = arguments.images / "report.png"
@@ -170,9 +175,13 @@ def main() -> None:
 
 
 def smaller(path: Path) -> None:
-    """Keep a picture in 128 colours."""
-    image = Image.open(path).convert("RGB").quantize(128, dither=Image.Dither.NONE)
-    image.save(path, optimize=True)
+    """Keep a picture in 128 colours, in the largest width in which its file is small."""
+    image = Image.open(path).convert("RGB")
+    for width in WIDTHS:
+        image.thumbnail((width, width))
+        image.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+        if path.stat().st_size < LARGEST_BYTES:
+            break
 
 
 if __name__ == "__main__":
