@@ -110,7 +110,7 @@ def test_a_rival_elsewhere_in_the_survey_counts(source: tuple[Path, np.ndarray],
     assert result.verdict.metrics["hypothesis_margin"] < 1.3
     rival = result.verdict.rivals[0]
     assert rival.far
-    assert np.hypot(rival.east, rival.north) == pytest.approx(np.hypot(*FAR[:2]), abs=2.0)
+    assert rival.apart_m == pytest.approx(np.hypot(*FAR[:2]), abs=2.0)
 
 
 @pytest.mark.slow
