@@ -237,6 +237,25 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.match verticals[].strength``: of the best hypothesis there; null where nothing was found
 - ``mtpcr.match verticals[].margin``: over the next distinct one
 - ``mtpcr.match verticals[].taken``: whether the run went on from there
+- ``mtpcr.match margin_at_the_place``: in a survey, the margin over rivals at the place alone; ``margin`` is
+  the lesser of that and ``survey.margin``
+- ``mtpcr.match null_ratio_at_the_place``: likewise over the mirrored source at the place alone
+- ``mtpcr.match survey.place``: where the survey's mosaic puts the middle of the source's raster, in the
+  survey's CRS
+- ``mtpcr.match survey.yaw_deg``: how it is turned there
+- ``mtpcr.match survey.cell_m``: cell at which hypotheses of the survey are judged
+- ``mtpcr.match survey.searched[].cell_m``: cell of each level of the search
+- ``mtpcr.match survey.searched[].windows``: in how many windows it was searched
+- ``mtpcr.match survey.hypotheses``: hypotheses that were followed from there
+- ``mtpcr.match survey.margin``: strength of the best over that of the next anywhere in what was searched
+- ``mtpcr.match survey.null_ratio``: over the best of the mirrored source anywhere
+- ``mtpcr.match survey.strengths``: of the hypotheses judged
+- ``mtpcr.match survey.mirrored_strengths``: of those of the mirrored source
+- ``mtpcr.match survey.cut_out``: what was cut out of the survey as the target, in its CRS: lowest and highest
+  x and y
+- ``mtpcr.match survey.tiles[].path``: a tile that was read
+- ``mtpcr.match survey.tiles[].bytes``: its size
+- ``mtpcr.match survey.tiles[].modified_ns``: time of its last change, nanoseconds since 1970
 - ``mtpcr.match zoom``: factor by which images were reduced before keypoints were sought
 - ``mtpcr.match turns_deg``: turns of the source that were tried
 - ``mtpcr.match turn_matches``: matches at each of them

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import InputError, OptionError
 from mtpcr_geo.core.paths import real
 from mtpcr_geo.core.progress import NoProgress, Progress
@@ -232,10 +233,11 @@ def register_in_survey(
     opened = survey if isinstance(survey, Survey) else Survey.open(survey)
     progress = progress or NoProgress()
     reader = reader_of(source, "source", chosen.source_text)
-    if isinstance(source, str | os.PathLike):
-        cloud = open_any(Path(source), None, chosen.source_text)
-    else:
-        cloud = cloud_of(source, "source")
+    cloud: Cloud = (
+        open_any(Path(source), None, chosen.source_text)
+        if isinstance(source, str | os.PathLike)
+        else cloud_of(source, "source")
+    )
     writers = [] if out is None else writers_for(source, Path(out), chosen)
     _refuse_existing(writers, chosen)
     _check_foreign(source, opened)

@@ -218,7 +218,8 @@ class _Search:
             )
         source = self.both[0]
         return FoundPlace(
-            *self.pools,
+            self.pools[0],
+            self.pools[1],
             self.ground.origin,
             centre_of(source.grid),
             source.reach_m,
@@ -334,11 +335,11 @@ class _Search:
         found: list[list[Pose]] = [[], []]
         reach = max(one.reach_m for one in self.both) + MARGIN_M
         for key in sorted(chunks):
-            poses = chunks[key]
-            held = np.array([(pose.east, pose.north) for pose in poses[0] + poses[1]])
+            here = chunks[key]
+            held = np.array([(pose.east, pose.north) for pose in here[0] + here[1]])
             target = self.ground.bev(widened(np.stack([held.min(axis=0), held.max(axis=0)]), reach), middle)
             shared: Pyramid | None = None
-            for number, some in enumerate(poses):
+            for number, some in enumerate(here):
                 pyramid = _Window(coarse[number], target, made[number], shared)
                 shared = pyramid
                 fine = [

@@ -43,7 +43,6 @@ def _virtual(mosaic: Mosaic, places: Sequence[Place], number: int, factor: int) 
     band = ElementTree.SubElement(root, "VRTRasterBand", dataType="Float32", band="1")
     ElementTree.SubElement(band, "Description").text = BANDS[number - 1]
     ElementTree.SubElement(band, "NoDataValue").text = "nan"
-    size = {"xSize": str(side), "ySize": str(side)}
     for column, row in places:
         source = ElementTree.SubElement(band, "SimpleSource")
         if factor > 1:
@@ -58,8 +57,9 @@ def _virtual(mosaic: Mosaic, places: Sequence[Place], number: int, factor: int) 
             source, "SourceProperties", RasterXSize=str(side), RasterYSize=str(side), DataType="Float32",
             BlockXSize=str(block), BlockYSize=str(block),
         )  # fmt: skip
-        ElementTree.SubElement(source, "SrcRect", xOff="0", yOff="0", **size)
-        place = {"xOff": str((column - west) * side), "yOff": str((north - row - 1) * side)}
-        ElementTree.SubElement(source, "DstRect", **place, **size)
+        size = str(side)
+        ElementTree.SubElement(source, "SrcRect", xOff="0", yOff="0", xSize=size, ySize=size)
+        x, y = str((column - west) * side), str((north - row - 1) * side)
+        ElementTree.SubElement(source, "DstRect", xOff=x, yOff=y, xSize=size, ySize=size)
     ElementTree.indent(root, " ")
-    return ElementTree.tostring(root, encoding="utf-8")
+    return bytes(ElementTree.tostring(root, encoding="utf-8"))

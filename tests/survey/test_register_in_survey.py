@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -90,7 +91,7 @@ def test_the_run_is_on_record(found: Registration, survey: Survey) -> None:
 @pytest.mark.slow
 def test_what_is_known_beforehand_narrows_the_search(source: tuple[Path, np.ndarray], survey: Survey) -> None:
     place = transforms.apply(source[1], town_source()[0]).mean(axis=0)
-    near = {"near": (place[0] + 20.0, place[1] - 20.0), "within": 40.0, "source_crs": "local"}
+    near: dict[str, Any] = {"near": (place[0] + 20.0, place[1] - 20.0), "within": 40.0, "source_crs": "local"}
     result = register_in_survey(source[0], survey, **near)
     assert off(result, source[1])[0] < 0.1
     record = next(one for one in result.report if one.type == "mtpcr.match")
@@ -110,7 +111,7 @@ def test_a_rival_elsewhere_in_the_survey_counts(source: tuple[Path, np.ndarray],
     assert result.verdict.metrics["hypothesis_margin"] < 1.3
     rival = result.verdict.rivals[0]
     assert rival.far
-    assert np.hypot(rival.east, rival.north) == pytest.approx(np.hypot(*FAR[:2]), abs=2.0)
+    assert rival.apart_m == pytest.approx(np.hypot(*FAR[:2]), abs=2.0)
 
 
 @pytest.mark.slow
