@@ -111,7 +111,8 @@ class FrameLink(ComparesArrays):
 
     def metric(self, xyz: Floats) -> Floats:
         """Take (n, 3) coordinates, past the pipeline, to metres with z up, not shifted."""
-        return np.asarray(self._turned(xyz) * self.factor)
+        turned = self._turned(xyz)
+        return turned if self._is_metric else np.asarray(turned * self.factor)
 
     def to_work(self, xyz: Floats) -> Floats:
         """Take (n, 3) file coordinates to (n, 3) work coordinates in metres.
@@ -132,12 +133,18 @@ class FrameLink(ComparesArrays):
             CrsError: if the pipeline cannot take a point back.
 
         """
-        xyz = (np.asarray(xyz, np.float64) + self.origin) / self.factor
+        xyz = np.asarray(xyz, np.float64) + self.origin
+        if not self._is_metric:
+            xyz /= self.factor
         if self.scanner.axes != "z-up":
             xyz = xyz @ rotation_of(self.scanner.axes)
         if self.pipeline is not None:
             xyz = run_pipeline(self.pipeline, xyz, inverse=True)
         return np.asarray(xyz)
+
+    @property
+    def _is_metric(self) -> bool:
+        return bool((self.factor == 1.0).all())
 
     def _turned(self, xyz: Floats) -> Floats:
         return xyz if self.scanner.axes == "z-up" else xyz @ rotation_of(self.scanner.axes).T

@@ -5,6 +5,8 @@ A variable ``T_to_from`` takes coordinates of frame ``from`` to frame ``to``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,24 +16,35 @@ Points = NDArray[np.float64]
 
 def apply(T_to_from: Matrix, xyz: Points) -> Points:
     """Move points: (n, 3) coordinates in ``from`` become (n, 3) coordinates in ``to``."""
-    xyz = np.asarray(xyz, np.float64)
-    moved = np.empty(xyz.shape)
-    if xyz.ndim != 2 or len(xyz) <= _BLOCK:
-        _apply(T_to_from, xyz, moved)
-        return moved
-    for start in range(0, len(xyz), _BLOCK):
-        _apply(T_to_from, xyz[start : start + _BLOCK], moved[start : start + _BLOCK])
-    return moved
+    return by_blocks(lambda some: _apply(T_to_from, some), np.asarray(xyz, np.float64))
 
 
 _BLOCK = 32_768  # rows whose columns fit into a processor's cache
 
 
-def _apply(T_to_from: Matrix, xyz: Points, moved: Points) -> None:
+def by_blocks(move: Callable[[Points], Points], xyz: Points) -> Points:
+    """Move points some thousand at a time, which for long arrays takes half the time.
+
+    Args:
+        move: takes (k, 3) points to (k, 3), each by itself.
+        xyz: (n, 3) points; any other shape is moved at once.
+
+    """
+    if xyz.ndim != 2 or len(xyz) <= _BLOCK:
+        return move(xyz)
+    moved = np.empty(xyz.shape)
+    for start in range(0, len(xyz), _BLOCK):
+        moved[start : start + _BLOCK] = move(xyz[start : start + _BLOCK])
+    return moved
+
+
+def _apply(T_to_from: Matrix, xyz: Points) -> Points:
+    moved = np.empty(xyz.shape)
     # written out: BLAS is ten times slower on long arrays of three columns, and sums as it likes
     x, y, z = xyz[..., 0], xyz[..., 1], xyz[..., 2]
     for i, (a, b, c, t) in enumerate(T_to_from[:3]):
         moved[..., i] = a * x + b * y + c * z + t
+    return moved
 
 
 def compose(R: Matrix, t: Points) -> Matrix:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -59,11 +60,24 @@ class TransformChain(ComparesArrays):
 
     def forward(self, xyz: Floats) -> Floats:
         """Take (n, 3) source file coordinates to (n, 3) target file coordinates."""
-        return self.target.to_file(transforms.apply(self.T_target_source, self.source.to_work(xyz)))
+        return self._moved(
+            lambda some: self.target.to_file(
+                transforms.apply(self.T_target_source, self.source.to_work(some))
+            ),
+            xyz,
+        )
 
     def inverse(self, xyz: Floats) -> Floats:
         """Take (n, 3) target file coordinates to (n, 3) source file coordinates."""
-        return self.source.to_file(transforms.apply(self.T_source_target, self.target.to_work(xyz)))
+        T_source_target = self.T_source_target
+        return self._moved(
+            lambda some: self.source.to_file(transforms.apply(T_source_target, self.target.to_work(some))),
+            xyz,
+        )
+
+    def _moved(self, move: Callable[[Floats], Floats], xyz: Floats) -> Floats:
+        # PROJ takes its time to begin
+        return transforms.by_blocks(move, np.asarray(xyz, np.float64)) if self.is_affine else move(xyz)
 
     @property
     def shift_m(self) -> Floats | None:

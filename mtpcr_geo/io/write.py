@@ -238,20 +238,22 @@ def _placed(
             if offsets is None:
                 offsets = np.rint((moved.min(axis=0) + moved.max(axis=0)) / 2)
             header.offsets = offsets
-            steps = moved - offsets
-            steps /= storage.scales
-            np.rint(steps, out=steps)
+            steps = np.empty((3, len(moved)))
+            for axis, of_axis in enumerate(steps):
+                np.subtract(moved[:, axis], offsets[axis], out=of_axis)
+                of_axis /= storage.scales[axis]
+                np.rint(of_axis, out=of_axis)
         # a NaN makes it one
         worst = float(np.maximum(steps.max(), -steps.min()))
         kept = packed
         if not worst <= MOST_STEPS:
             if storage.offsets is None:
                 raise MisfitError
-            fits = (np.abs(steps) <= MOST_STEPS).all(axis=1)
+            fits = (np.abs(steps) <= MOST_STEPS).all(axis=0)
             storage.left_out += int((~fits).sum())
-            kept, steps = packed[fits], steps[fits]
-        for axis, name in enumerate("XYZ"):
-            kept[name] = steps[:, axis]
+            kept, steps = packed[fits], steps[:, fits]
+        for name, of_axis in zip("XYZ", steps, strict=True):
+            kept[name] = of_axis
         if len(kept):
             yield kept
         advance(len(packed))

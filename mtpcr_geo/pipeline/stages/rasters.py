@@ -183,7 +183,9 @@ def in_work_frame(link: FrameLink, xyz: Floats) -> Floats:
     Far from the origin a float64 coordinate carries nanometres of noise, and points that a LAS scale puts
     exactly on the line between two cells would fall to either side by it.
     """
-    return np.round(link.to_work(xyz), 5)
+    if link.pipeline is not None:
+        return np.round(link.to_work(xyz), 5)
+    return transforms.by_blocks(lambda some: np.round(link.to_work(some), 5), xyz)
 
 
 class BevOptions(StageOptions):
