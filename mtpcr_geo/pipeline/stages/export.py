@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -15,17 +14,14 @@ from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.recorder import NullRecorder
 from mtpcr_geo.core.system import command_line, peak_memory_mb
 from mtpcr_geo.core.types import Pair, Side, Verdict
-from mtpcr_geo.core.wording import visible
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.export.recording.budget import DEFAULT_MB, LEAST_MB, Budget
-from mtpcr_geo.pipeline.options import OUTPUT_NAMES, Force
+from mtpcr_geo.pipeline.options import Force
 from mtpcr_geo.pipeline.records import Written
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
-
-    from mtpcr_geo.export.qgis.layers import LayerFile
 
 TransformFormat = Literal["json", "cloudcompare", "pdal"]
 DERIVED_ROLES = ("registered", "difference", "target_upright")
@@ -238,61 +234,6 @@ class WriteTiePoints(EvidenceWriter):
         from mtpcr_geo.export.tie_points import write_tie_points
 
         write_tie_points(context.outputs.path(self.options.filename), pair)
-
-
-class ProjectFileOptions(FileOptions):
-    """Options of mtpcr.write_project."""
-
-    filename: Path = Field(description="QGIS project to write, .qgz")
-    rasters: Path | None = Field(
-        None,
-        description="the files of mtpcr.write_bev, with their #; bev/#.tif beside the project if not given",
-    )
-    tie_points: Path | None = Field(
-        None,
-        description="the file of mtpcr.write_tie_points; ties.gpkg beside the project if not given",
-    )
-
-
-class WriteProject(EvidenceWriter):
-    """Write a QGIS project of the rasters and tie points that the run leaves, whatever this stage's place."""
-
-    type = "mtpcr.write_project"
-    late = True
-    Options: ClassVar[OptionsModel] = ProjectFileOptions
-    options: ProjectFileOptions
-
-    def write(self, pair: Pair, context: RunContext) -> None:
-        """Write the project, or say that there is nothing to show."""
-        from mtpcr_geo.export.qgis.project import About, write_project
-
-        folder = self.options.filename.parent
-        named = self.options.rasters or folder / OUTPUT_NAMES["bev"]
-        roles = ("source", "target", *DERIVED_ROLES) if "#" in named.name else ("target",)
-        rasters = {
-            role: self._file(named.with_name(named.name.replace("#", role)), context) for role in roles
-        }
-        ties = self._file(self.options.tie_points or folder / OUTPUT_NAMES["tie_points"], context)
-        found = {role: file for role, file in rasters.items() if file is not None}
-        if not found and ties is None:
-            self._skip("the run leaves neither rasters nor tie points")
-            return
-        sentence = pair.verdict.headline if pair.verdict is not None else "The pair was not judged."
-        about = About(Path(pair.source.cloud.name).name, Path(pair.target.cloud.name).name, sentence)
-        write_project(context.outputs.path(self.options.filename), found, ties, about)
-
-    def _file(self, final: Path, context: RunContext) -> LayerFile | None:
-        from mtpcr_geo.export.qgis.layers import LayerFile
-
-        part = context.outputs.part_of(final)
-        if part is None:
-            return None
-        try:
-            where = Path(os.path.relpath(final, self.options.filename.parent)).as_posix()
-        except ValueError:  # another drive
-            where = final.resolve().as_posix()
-        here = "" if where.startswith("..") or Path(where).is_absolute() else "./"
-        return LayerFile(visible(here + where), part)
 
 
 class TransformFileOptions(FileOptions):

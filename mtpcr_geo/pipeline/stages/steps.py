@@ -26,11 +26,9 @@ from mtpcr_geo.pipeline.stages.export import (
     ApplyOptions,
     BevFileOptions,
     FileOptions,
-    ProjectFileOptions,
     RecordingOptions,
     TransformFileOptions,
     WriteBev,
-    WriteProject,
     WriteRecording,
     WriteReport,
     WriteRun,
@@ -60,6 +58,7 @@ from mtpcr_geo.pipeline.stages.matching import (
     MatchOptions,
 )
 from mtpcr_geo.pipeline.stages.memory import MemoryReader, SavedRecording
+from mtpcr_geo.pipeline.stages.project import ProjectFileOptions, WriteProject
 from mtpcr_geo.pipeline.stages.rasters import BevOptions, Level, LevelOptions, MakeBev
 from mtpcr_geo.pipeline.stages.solving import (
     Assess,
