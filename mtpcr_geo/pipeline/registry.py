@@ -15,7 +15,7 @@ from mtpcr_geo.core.suggestions import meant
 from mtpcr_geo.pipeline.options import first_problem as first_problem
 from mtpcr_geo.pipeline.stage import Stage, StageOptions
 
-_MODULES = ("io", "rasters", "matching", "solving", "export", "register")
+_MODULES = ("io", "rasters", "matching", "solving", "export", "project", "register")
 
 
 @cache
