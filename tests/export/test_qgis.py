@@ -198,14 +198,13 @@ def test_projects_of_real_pairs(name, shared_data, tmp_path):
     check(out, found, tmp_path / "pictures")
 
 
-def test_the_algorithms_of_the_plugin(tmp_path):
+def test_the_algorithms_of_the_plugin(demo, tmp_path):
     done = CliRunner().invoke(app, ["qgis-plugin", "-o", str(tmp_path / "p.zip")])
     assert done.exit_code == 0
     with zipfile.ZipFile(tmp_path / "p.zip") as archive:
         archive.extractall(tmp_path / "plugins")
     home, plugins = tmp_path / "home", tmp_path / "plugins"
-    run_demo(tmp_path / "demo", recording=False)
-    clouds = [f"SOURCE={tmp_path / 'demo' / 'ground.laz'}", f"TARGET={tmp_path / 'demo' / 'aerial.laz'}"]
+    clouds = [f"SOURCE={demo.parent / 'ground.laz'}", f"TARGET={demo.parent / 'aerial.laz'}"]
     enabled = process(["plugins", "enable", "mtpcr_geo_qgis"], home, plugins)
     assert enabled.returncode == 0, enabled.stderr
 
