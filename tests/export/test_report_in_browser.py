@@ -1,4 +1,4 @@
-"""The report in a real browser: its script runs under its policy and no other does, and it prints on a few pages."""
+"""The report in a real browser: its script runs and no other, and it prints on a few pages."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_its_script_runs_and_no_other(page: Path, tmp_path: Path) -> None:
     assert "--at:50%" in done.stdout.replace(" ", "")
     assert "<img src=x" not in done.stdout
     assert "&lt;img src=x onerror=alert(1)&gt;.laz" in done.stdout
-    # errors of scripts, and whatever the page's policy keeps from being fetched, are logged as from the console
+    # errors of scripts, and what the page's policy keeps from being fetched, are logged as from the console
     assert "CONSOLE" not in done.stderr, done.stderr
 
 
