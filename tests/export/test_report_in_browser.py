@@ -1,4 +1,4 @@
-"""The report in a real browser: its own script runs, no other does, and it prints on a few pages."""
+"""The report in a real browser: its script runs and no other, and it prints on a few pages."""
 
 from __future__ import annotations
 
