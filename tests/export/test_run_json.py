@@ -87,7 +87,7 @@ def found_keys(
         out = tmp_path_factory.mktemp(name) / "out"
         # one of them with a cloud in memory
         source = laspy.read(town_files[0]) if name == "prior" else town_files[0]
-        register(source, town_files[1], out, recording=False, **options)
+        register(source, town_files[1], out, recording=name == "correlation", **options)
         found[name] = keys_of(json.loads((out / "run.json").read_text()))
     # dense enough for a last, finer round of the refinement
     rng = np.random.default_rng(3)
