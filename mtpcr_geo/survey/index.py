@@ -166,9 +166,9 @@ class Survey:
         """Write the tiles as a virtual point cloud, whole or not at all."""
         ordered = replace(self, tiles=tuple(sorted(self.tiles, key=lambda tile: (tile.path.name, tile.id))))
         features = [_feature_of(tile, ordered) for tile in ordered.tiles]
-        write_atomic(
-            self.folder / INDEX, json.dumps({"type": "FeatureCollection", "features": features}, indent=1)
-        )
+        # a line a tile: an index of a country is read whole
+        lines = ",\n".join(json.dumps(one, separators=(",", ":")) for one in features)
+        write_atomic(self.folder / INDEX, f'{{"type":"FeatureCollection","features":[\n{lines}\n]}}\n')
 
     def with_tiles(self, tiles: Iterable[Tile]) -> Survey:
         """Return the survey with other tiles."""

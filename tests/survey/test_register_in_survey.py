@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +13,20 @@ from helpers_survey import ETRS, tiles_of, town_source, town_target, write_tile
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import InputError, OptionError, RegistrationError
+from mtpcr_geo.core.types import Matches
+from mtpcr_geo.export import run_json
+from mtpcr_geo.match.candidates import Candidate, Pool
+from mtpcr_geo.match.patches import PatchMatches
+from mtpcr_geo.match.pose import Pose
+from mtpcr_geo.method.scales import scales_for
 from mtpcr_geo.registration import Registration
 from mtpcr_geo.survey.build import build_survey
+from mtpcr_geo.survey.cut import cut_out
 from mtpcr_geo.survey.index import Survey
+from mtpcr_geo.survey.locate import Located
 from mtpcr_geo.survey.options import BuildOptions
-from mtpcr_geo.survey.register import register_in_survey
+from mtpcr_geo.survey.register import in_survey, register_in_survey
+from mtpcr_geo.survey.search import FoundPlace
 
 HERE = BuildOptions(workers=1, cell=1.0)
 FAR = np.array([700.0, 300.0, 4.0])
@@ -83,7 +94,14 @@ def test_a_scan_is_found_and_registered_to_the_points(
 def test_the_run_is_on_record(found: Registration, survey: Survey) -> None:
     data = json.loads(found.outputs["run"].read_text(encoding="utf-8"))
     match = next(stage for stage in data["stages"] if stage["type"] == "mtpcr.match")
-    assert match["metadata"]["survey"]["cell_m"] == 1.0
+    survey_facts = match["metadata"]["survey"]
+    assert survey_facts["cell_m"] == 1.0
+    listed = re.findall(r"``mtpcr\.match survey\.([\w.\[\]]+)``", run_json.__doc__ or "")
+    assert {key.partition("[")[0] for key in listed} == set(survey_facts)
+    for inner in ("searched", "tiles"):
+        named = {key.partition(".")[2] for key in listed if key.startswith(f"{inner}[]")}
+        assert named == set(survey_facts[inner][0])
+    assert {"margin_at_the_place", "null_ratio_at_the_place"} <= set(match["metadata"])
     assert data["metrics"]["hypothesis_margin"] == found.verdict.metrics["hypothesis_margin"]
     assert found.outputs["registered"].is_file()
 
@@ -100,6 +118,43 @@ def test_what_is_known_beforehand_narrows_the_search(source: tuple[Path, np.ndar
         register_in_survey(source[0], survey, near=(0.0, 0.0), within=40.0, source_crs="local")
 
 
+def candidate(pose: Pose, agreeing: int = 20) -> Candidate:
+    px = np.zeros((20, 2))
+    return Candidate(pose, PatchMatches(px, px, np.ones(20), px, 20), np.arange(20) < agreeing)
+
+
+def test_rivals_and_the_mirrored_world_of_the_whole_survey_count() -> None:
+    best, rival = candidate(Pose(0.3, 10.0, 20.0, 40.0)), candidate(Pose(0.3, 900.0, 20.0, 32.0))
+    again = candidate(Pose(0.3, 10.5, 20.0, 30.0))
+    mirrored = Pool((candidate(Pose(1.0, 0.0, 0.0, 25.0)),), (22.5,))
+    scales = scales_for(1.0, 10_000.0)
+    pivot = np.zeros(2)
+    pool = Pool((best, rival, again), (36.0, 28.8, 27.0))
+    place = FoundPlace(pool, mirrored, pivot, pivot, 50.0, scales, ((8.0, 1),), 3)
+    located = Located(place, pivot, pivot, np.zeros((2, 2)))
+    hypotheses = [one.pose.hypothesis(pivot) for one in pool.candidates]
+    px = np.zeros((4, 2))
+    # at the place nothing rivals it, and strengths are those of finer cells
+    here = replace(best.pose.hypothesis(pivot), strength=72.0)
+    matches = Matches(
+        px,
+        px,
+        np.ones(4),
+        (here,),
+        margin=1000.0,
+        strength=72.0,
+        null_ratio=9.0,
+        mirrored_strengths=(8.0,),
+    )
+    found = in_survey(matches, located, hypotheses)
+    assert found.margin == pool.margin == 36.0 / 28.8
+    assert found.null_ratio == pytest.approx(40.0 / 25.0)
+    # the same place found twice is no rival; the other one is, at the strength it has beside the best
+    assert [one.strength for one in found.hypotheses] == pytest.approx([72.0, 72.0 * 28.8 / 36.0])
+    assert found.mirrored_strengths == pytest.approx((72.0 * 25.0 / 40.0, 8.0))
+
+
+@pytest.mark.slow
 def test_a_rival_elsewhere_in_the_survey_counts(source: tuple[Path, np.ndarray], tmp_path: Path) -> None:
     town = town_target()
     tiles = tiles_of(tmp_path / "tiles", town)
@@ -138,12 +193,19 @@ def test_what_does_not_go_with_a_survey_is_refused(
         register_in_survey(source[0], tmp_path)
 
 
-def test_a_tile_that_changed_since_is_not_used(source: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+def test_the_points_at_a_place_are_those_that_the_survey_was_built_of(tmp_path: Path) -> None:
     tile = write_tile(tmp_path / "tile.laz", town_target(points=20_000))
     survey = build_survey([tile], tmp_path / "survey", HERE).survey
+    box = survey.bounds[:, :2]
+    assert cut_out(survey, box).count == 20_000
+    west = cut_out(survey, np.stack([box[0], [box[0, 0] + 50.0, box[1, 1]]]))
+    assert 0 < west.count < 20_000
+    assert west.maximum[0] <= box[0, 0] + 50.0
+    with pytest.raises(InputError, match="hold no points"):
+        cut_out(survey, box + 10_000.0)
     write_tile(tile, town_target(points=19_000))
     with pytest.raises(InputError, match="run survey build again"):
-        register_in_survey(source[0], survey, source_crs="local")
+        cut_out(survey, box)
 
 
 def test_nothing_to_compare_is_said(survey: Survey) -> None:
