@@ -16,8 +16,8 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.system import sha256
 from mtpcr_geo.match.base import View
 from mtpcr_geo.match.correlation import CorrelationSettings
-from mtpcr_geo.match.learned.model_cards import look_of, path_of
 from mtpcr_geo.match.learned.model_cards import descriptions as described
+from mtpcr_geo.match.learned.model_cards import look_of, path_of
 from mtpcr_geo.match.registry import KeypointSettings, make_matcher
 from mtpcr_geo.method.images import band_image
 from mtpcr_geo.registration import register

@@ -148,8 +148,8 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
     seed = options.seed
     matcher = options.matcher or "bev"
     match = MatchOptions(method=matcher, models=options.models, seed=seed)
-    # weights trained on height images see nothing in others, and want one cell for both clouds; other matchers
-    # get the paper's image (Eq. 3 and 4) and cells (Eq. 1)
+    # weights trained on height images see nothing in others, and want one cell for both clouds; any other
+    # matcher gets the paper's image (Eq. 3 and 4) and cells (Eq. 1)
     trained_on = look_of(matcher, models_folder(options.models))
     look = (trained_on or "paper") if options.enhance else "grey"
     if not options.res:
