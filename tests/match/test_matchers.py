@@ -391,14 +391,20 @@ def test_paper_profile_and_its_switches_in_the_pipeline():
 
     full = types()
     assert full["level"]["method"] == "ransac"
-    assert full["bev"]["resolution"] == "eq1"
+    # the weights of the package want one cell and a robust start; others get the paper's steps
+    assert full["bev"].get("resolution", "common") == "common"
+    assert full["solve"].get("robust_start", True)
+    published = types(matcher="superpoint")
+    assert published["bev"]["resolution"] == "eq1"
+    assert published["solve"] == {
+        "type": "mtpcr.solve", "tag": "solve", "upright": False, "robust_start": False
+    }  # fmt: skip
     # the weights of the package see what they were trained on, others the paper's image
     assert full["enhance"].get("look", "band_pass") == "band_pass"
     assert full["match"]["method"] == "bev"
     for matcher in ("superpoint", "rootsift"):
         assert types(matcher=matcher)["enhance"]["look"] == "paper"
     assert types(enhance=False)["enhance"]["look"] == "grey"
-    assert full["solve"] == {"type": "mtpcr.solve", "tag": "solve", "upright": False, "robust_start": False}
     assert full["refine"]["method"] == "point_to_point"
     bare = types(res=False, focus=False, enhance=False, matcher="rootsift")
     assert bare["bev"] == {"type": "mtpcr.bev", "tag": "bev", "cell": 1.0, "pixel": "ceil"}

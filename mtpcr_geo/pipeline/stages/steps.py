@@ -149,16 +149,25 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
             "--prior, --near, --yaw and --motion are not of the paper; leave them out, or --profile paper"
         )
     seed = options.seed
-    # without RES coordinates stay metres, and Eq. 2 makes pixels of one
-    bev = (
-        BevOptions(cell=options.cell, resolution="eq1", pixel="ceil")
-        if options.res
-        else BevOptions(cell=options.cell or 1.0, pixel="ceil")
-    )
     matcher = options.matcher or "bev"
     match = MatchOptions(method=matcher, models=options.models, seed=seed)
-    # weights trained on one image see nothing in another; other matchers get the paper's (Eq. 3 and 4)
-    look = (look_of(matcher, models_folder(options.models)) or "paper") if options.enhance else "grey"
+    # weights trained on height images see nothing in others, and want one cell for both clouds; any other
+    # matcher gets the paper's image (Eq. 3 and 4) and cells (Eq. 1)
+    trained_on = look_of(matcher, models_folder(options.models))
+    look = (trained_on or "paper") if options.enhance else "grey"
+    if not options.res:
+        # without RES coordinates stay metres, and Eq. 2 makes pixels of one
+        bev = BevOptions(cell=options.cell or 1.0, pixel="ceil")
+    elif trained_on is not None:
+        bev = BevOptions(cell=options.cell, finest=FINEST_OF_LEARNED_M, pixel="ceil")
+    else:
+        bev = BevOptions(cell=options.cell, resolution="eq1", pixel="ceil")
+    # most matches of a small network are wrong, which an SVD over all of them does not survive
+    solve = (
+        SolveOptions(upright=False, robust_start=False, seed=seed)
+        if trained_on is None
+        else SolveOptions(tries=MANY_TRIES, seed=seed)
+    )
     refine = RefineOptions(
         method="point_to_point",
         ground=False,
@@ -176,7 +185,7 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
     return [
         *steps,
         InverseMapping(lift, f"{prefix}inverse_mapping"),
-        Solve(SolveOptions(upright=False, robust_start=False, seed=seed), f"{prefix}solve"),
+        Solve(solve, f"{prefix}solve"),
         Refine(refine, f"{prefix}refine"),
         Assess(AssessOptions(), f"{prefix}assess"),
     ]
