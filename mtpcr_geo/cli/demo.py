@@ -164,8 +164,8 @@ def _summary(truth: Truth, registration: Registration, errors: Errors | None, fo
             f"centroid {errors.plan_m:.2f} m in plan and {errors.height_m:+.2f} m in height."
         )
     written = registration.outputs
-    if "registered" in written:
-        lines.append(f"Open in QGIS: {written['registered']} over {folder / AERIAL}")
+    if "project" in written:
+        lines.append(f"Open in QGIS: {written['project']}")
     if "recording" in written:
         lines.append(f"Replay the run: mtpcr-geo review {folder / RESULT}")
     if "report" in written:
