@@ -9,6 +9,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ from mtpcr_geo.core.errors import MissingPartError, MtpcrError
 
 CHUNK_POINTS = 1_000_000
 CELL_M = 1.0
+LOOK_S = 0.02
+"""How often the memory of a process is looked at, seconds."""
 MOVE = "0.8 -0.6 0 20 0.6 0.8 0 -10 0 0 1 3 0 0 0 1"
 """A turn of 37 degrees and a shift, as filters.transformation of PDAL has it."""
 
@@ -49,20 +52,37 @@ def measured(command: Sequence[str | Path]) -> Measured:
     if not hasattr(os, "wait4"):
         raise MissingPartError("this system does not tell what a process took; run this on Linux or macOS")
     start = time.perf_counter()
-    with subprocess.Popen(
-        [str(word) for word in command], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
-    ) as process:
-        assert process.stderr is not None
-        printed = process.stderr.read()
-        _, status, used = os.wait4(process.pid, 0)
+    peak = None
+    with tempfile.TemporaryFile() as said:
+        process = subprocess.Popen([str(word) for word in command], stdout=subprocess.DEVNULL, stderr=said)
+        pid = 0
+        while pid == 0:
+            # by Linux's rusage a process has had the memory of the one that started it, too
+            peak = _largest_memory(process.pid) or peak
+            pid, status, used = os.wait4(process.pid, os.WNOHANG)
+            if pid == 0:
+                time.sleep(LOOK_S)
         process.returncode = os.waitstatus_to_exitcode(status)
-    wall = time.perf_counter() - start
+        wall = time.perf_counter() - start
+        said.seek(0)
+        printed = said.read()
     if process.returncode not in (0, 3, 4):  # a verdict is no failure of the run
         last = (printed.decode(errors="replace").strip().splitlines() or [""])[-1]
         raise MtpcrError(f"{' '.join(str(word) for word in command[:6])} ... failed: {last}")
     # bytes on macOS, kibibytes elsewhere
     unit = 2**20 if sys.platform == "darwin" else 2**10
-    return Measured(wall, used.ru_utime + used.ru_stime, used.ru_maxrss / unit)
+    return Measured(wall, used.ru_utime + used.ru_stime, peak or used.ru_maxrss / unit)
+
+
+def _largest_memory(pid: int) -> float | None:
+    """Return the largest memory of a running process so far, MiB; None where Linux does not tell."""
+    try:
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 2**10
+    except OSError:
+        pass
+    return None
 
 
 def job(name: str, *paths: str | Path) -> list[str]:
