@@ -82,13 +82,16 @@ def test_export_lightglue(tmp_path: Path) -> None:
     assert usable["aliked_lightglue"]
     # an image finds itself, shifted
     from mtpcr_geo.match.correlation import CorrelationSettings
+    from mtpcr_geo.match.keypoints import KeypointMatcher
     from mtpcr_geo.match.registry import KeypointSettings, make_matcher
 
     texture = np.random.default_rng(1).integers(0, 255, (24, 30)).astype(np.uint8)
     image = cv2.resize(texture, (240, 192), interpolation=cv2.INTER_CUBIC)
     for name in ("disk_lightglue", "aliked_lightglue"):
         settings = KeypointSettings(models=tmp_path, max_keypoints=200, threads=1)
-        images = make_matcher(name, CorrelationSettings(), settings).images
+        matcher = make_matcher(name, CorrelationSettings(), settings)
+        assert isinstance(matcher, KeypointMatcher)
+        images = matcher.images
         found = images.match(images.prepare(image[8:, 16:], 127), images.prepare(image[:-8, :-16], 127))
         assert len(found) > 30
         shift = np.median(found.target_px - found.source_px, axis=0)
