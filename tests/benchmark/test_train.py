@@ -144,6 +144,7 @@ def test_a_tiny_training_gives_files_that_match(tmp_path, town_views):
     assert again["files"] == facts["files"]
     # and they are what the matcher takes: an image and itself, shifted
     from mtpcr_geo.match.correlation import CorrelationSettings
+    from mtpcr_geo.match.keypoints import KeypointMatcher
     from mtpcr_geo.match.registry import KeypointSettings, make_matcher
 
     card = files("mtpcr_geo.match.learned").joinpath("cards", "bev.toml").read_text(encoding="utf-8")
@@ -152,6 +153,7 @@ def test_a_tiny_training_gives_files_that_match(tmp_path, town_views):
     unsure = card.replace("score_threshold = 0.1", "score_threshold = 0.0")
     (tmp_path / "a" / "tiny.toml").write_text(unsure, encoding="utf-8")
     matcher = make_matcher("tiny", CorrelationSettings(), KeypointSettings(models=tmp_path / "a", threads=1))
+    assert isinstance(matcher, KeypointMatcher)
     image = max(town_views, key=lambda view: view.image.size).image
     first, second = (matcher.images.prepare(part, 127) for part in (image[8:, 16:], image[:-8, :-16]))
     found = matcher.images.match(first, second)
