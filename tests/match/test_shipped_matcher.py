@@ -91,6 +91,7 @@ def test_the_same_matches_each_time():
     assert np.array_equal(one.score, other.score)
 
 
+@pytest.mark.slow
 def test_paper_profile_needs_no_option_and_no_file(town_files, tmp_path):
     from helpers_scene import ORIGIN
 
