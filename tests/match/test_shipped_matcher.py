@@ -74,8 +74,8 @@ def test_two_scans_of_a_town_at_any_yaw(yaw_deg):
     T = transforms.compose(transforms.yaw_matrix(np.radians(yaw_deg)), np.array([12.0, -7.0, 0.0]))
     target = town(rng, 60_000)
     source = transforms.apply(transforms.inverse(T), town(rng, 60_000))
-    views = [View(bev, band_image(bev)) for bev in (rasterise(xyz, 0.5) for xyz in (source, target))]
-    found = matcher().match(*views)
+    bevs = [rasterise(xyz, 0.5) for xyz in (source, target)]
+    found = matcher().match(*(View(bev, band_image(bev)) for bev in bevs))
     best = found.hypotheses[0]
     assert abs((best.yaw - np.radians(yaw_deg) + np.pi) % (2 * np.pi) - np.pi) < np.radians(2.0)
     assert np.hypot(best.shift[0] - 12.0, best.shift[1] + 7.0) < 1.5
@@ -91,6 +91,7 @@ def test_the_same_matches_each_time():
     assert np.array_equal(one.score, other.score)
 
 
+@pytest.mark.slow
 def test_paper_profile_needs_no_option_and_no_file(town_files, tmp_path):
     from helpers_scene import ORIGIN
 

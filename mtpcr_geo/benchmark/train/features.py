@@ -68,7 +68,8 @@ def train_features(
 
     """
     torch.manual_seed(seed)
-    network: BevPoint = BevPoint(width).to(device).to(memory_format=torch.channels_last)
+    network = BevPoint(width)
+    network.to(device).to(memory_format=torch.channels_last)
     optimiser = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=1e-3)
     first = _resume(checkpoint, network, optimiser, curve)
     network.train()

@@ -110,7 +110,8 @@ def train_matcher(
         )
         for _ in range(pairs)
     ]
-    matcher: BevGlue = BevGlue().to(device)
+    matcher = BevGlue()
+    matcher.to(device)
     optimiser = torch.optim.AdamW(matcher.parameters(), lr=rate, weight_decay=1e-3)
     steps, step = epochs * (pairs // batch), 0
     for _ in range(epochs):
