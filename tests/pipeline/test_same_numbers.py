@@ -146,11 +146,11 @@ def test_every_place_says_the_same(name: str, force: bool, tmp_path: Path) -> No
         assert {"metrics.within_95_plan_m", "metrics.sigma_yaw_deg"} <= set(shown)
     numbers = {key for key, value in run["metrics"].items() if type(value) in (int, float)}
     assert {path for path in shown if path.startswith("metrics.")} == {f"metrics.{key}" for key in numbers}
-    for place, found in shown.items():
+    for place, printed in shown.items():
         value = run
         for key in place.split("."):
             value = value[key]
-        for figure in found:
+        for figure in printed:
             assert figure.value == value, place
             assert_rounded(figure, value)
 
