@@ -18,7 +18,6 @@ from rich.console import Console
 from mtpcr_geo.cli.summary import print_registration
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.export import descriptions
-from mtpcr_geo.export.recording.budget import Budget
 from mtpcr_geo.export.recording.writer import RecordingWriter
 from mtpcr_geo.pipeline.runner import RunResult
 from mtpcr_geo.registration import Registration
@@ -61,7 +60,7 @@ def recorded(pair: Pair, path: Path) -> str:
     """The summary that a recording begins with, as the viewer gets it."""
     from rerun.chunk import RrdReader
 
-    writer = RecordingWriter(path, Budget(1.0), 0)
+    writer = RecordingWriter(path, 500, 0)
     writer.begin({})
     writer.after("mtpcr.assess", "assess", {}, pair, 0.1)
     writer.close()
@@ -147,11 +146,11 @@ def test_every_place_says_the_same(name: str, force: bool, tmp_path: Path) -> No
         assert {"metrics.within_95_plan_m", "metrics.sigma_yaw_deg"} <= set(shown)
     numbers = {key for key, value in run["metrics"].items() if type(value) in (int, float)}
     assert {path for path in shown if path.startswith("metrics.")} == {f"metrics.{key}" for key in numbers}
-    for place, figures in shown.items():
+    for place, printed in shown.items():
         value = run
         for key in place.split("."):
             value = value[key]
-        for figure in figures:
+        for figure in printed:
             assert figure.value == value, place
             assert_rounded(figure, value)
 
