@@ -102,10 +102,16 @@ def open_viewer(file: Path, *, browser: bool) -> None:
     """
     from mtpcr_geo.core.errors import MissingPartError
 
-    note(
-        "the viewer is rerun's: it sends usage data, and nothing of the recording, unless switched off by: "
-        f"{' '.join(VIEWER)} analytics disable"
-    )
+    if browser:
+        note(
+            "the viewer is rerun's: its page sends usage data to tel.rerun.io, and asks app.rerun.io and "
+            "fonts.googleapis.com; it works where they are not reached"
+        )
+    else:
+        note(
+            "the viewer is rerun's: it sends usage data, by rerun's account nothing of the recording, unless "
+            f"switched off by: {' '.join(VIEWER)} analytics disable"
+        )
     more = ("--web-viewer", "--bind", "127.0.0.1") if browser else ()
     command = [*VIEWER, *more, str(file)]
     try:
