@@ -10,7 +10,6 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import wraps
 from typing import ParamSpec, TypeVar
 
 from mtpcr_geo.core.errors import MtpcrError
@@ -59,13 +58,7 @@ def advising(spelling: Spelling, *, command: bool = False) -> Iterator[None]:
 
 def python_words(function: Callable[P, R]) -> Callable[P, R]:
     """Decorate a function of the Python interface: its errors name keywords, ``source_crs="local"``."""
-
-    @wraps(function)
-    def advised(*args: P.args, **kwargs: P.kwargs) -> R:
-        with advising(as_keyword):
-            return function(*args, **kwargs)
-
-    return advised
+    return advising(as_keyword)(function)
 
 
 def spelt(text: str, spelling: Spelling) -> str:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+RECORDING_MB, LEAST_RECORDING_MB = 5.0, 1.0
+"""Size of a recording at most, in millions of bytes: where nothing is said, and the least to ask for."""
+
 
 class Recorder(Protocol):
     """What keeps the record of a run. All geometry is given in work-frame metres."""

@@ -16,9 +16,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
+from mtpcr_geo.core.recorder import LEAST_RECORDING_MB, RECORDING_MB
 from mtpcr_geo.core.suggestions import meant
 from mtpcr_geo.core.units import UNITS, Axes, Unit
-from mtpcr_geo.export.recording.budget import DEFAULT_MB, LEAST_MB
 from mtpcr_geo.pipeline.file_options import Also, Scale, SourceText, TargetText
 from mtpcr_geo.pipeline.shown import (
     INPUTS,
@@ -365,7 +365,7 @@ class MethodOptions(PriorOptions):
 RecordingMb = Annotated[
     float,
     Field(
-        ge=LEAST_MB,
+        ge=LEAST_RECORDING_MB,
         description="size that the recording may have, megabytes: points and pictures are thinned to it",
     ),
     Shown(OUTPUT, metavar="MB"),
@@ -382,7 +382,7 @@ class RegisterOptions(MethodOptions):
     recording: Annotated[
         bool, Field(description="write a recording of the run for the rerun viewer"), Shown(OUTPUT)
     ] = True
-    recording_mb: RecordingMb = DEFAULT_MB
+    recording_mb: RecordingMb = RECORDING_MB
     force: Force = False
     overwrite: Overwrite = False
     threads: Threads = 0

@@ -8,11 +8,10 @@ where more than one process is wanted; nothing of it is imported before.
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 SURVEY = "survey.json"
 
 
 def is_survey(path: str | os.PathLike[str]) -> bool:
     """Return whether a path is the folder of a survey."""
-    return (Path(path) / SURVEY).is_file()
+    return os.path.isfile(os.path.join(path, SURVEY))

@@ -131,7 +131,7 @@ def run_batch(
     """
     folder = Path(folder)
     progress = progress or NoProgress()
-    foreign = folder.exists() and not (folder / MARK).is_file()
+    foreign = os.path.exists(folder) and not os.path.isfile(folder / MARK)
     if foreign and not options.overwrite and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder} is there already, and is no batch; name another folder, or --overwrite")
     write_atomic(folder / MARK, json.dumps({"format": "mtpcr-geo batch", "version": 1}))

@@ -166,7 +166,7 @@ def _frame(folder: Path, tiles: Sequence[Tile], options: BuildOptions) -> Frame:
         if options.crs is not None:
             _check_crs(options.crs, frame, f"--crs {options.crs}")
         return frame
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if os.path.exists(folder) and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder} is there already, and is no survey; name another folder")
     heads = _heads(tiles)
     crs = heads[0].crs if options.crs is None else parse_crs(options.crs)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -66,7 +67,7 @@ def jobs_of(path: Path, target: Path | None, common: Mapping[str, Any]) -> list[
         OptionError: if a column is no option, a value is none of it, or a target is missing.
 
     """
-    if path.suffix.lower() == ".csv" and path.is_file():
+    if path.suffix.lower() == ".csv" and os.path.isfile(path):
         return _of_table(path, target, common)
     sources = files_at(path)
     if target is None:

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.recorder import RECORDING_MB
 
-DEFAULT_MB = 5.0
-LEAST_MB = 1.0
 _MEGABYTE = 1_000_000
 # texts, matches, tie points and the layout
 _FIXED_BYTES = 150_000
@@ -33,7 +32,7 @@ class Budget:
 
     """
 
-    size_mb: float = DEFAULT_MB
+    size_mb: float = RECORDING_MB
 
     def points(self, view: str, times: int = 0) -> int:
         """Return how many points of one cloud a view may hold.
@@ -53,7 +52,7 @@ class Budget:
     @property
     def picture_side(self) -> int:
         """Longer side of a picture, pixels."""
-        return int(np.clip(_PICTURE_SIDE * np.sqrt(self.size_mb / DEFAULT_MB), _LEAST_SIDE, _MOST_SIDE))
+        return int(np.clip(_PICTURE_SIDE * np.sqrt(self.size_mb / RECORDING_MB), _LEAST_SIDE, _MOST_SIDE))
 
     @property
     def picture_bytes(self) -> int:
@@ -69,7 +68,7 @@ class Budget:
     @property
     def keypoints(self) -> int:
         """Keypoints an image."""
-        return max(int(_KEYPOINTS * self.size_mb / DEFAULT_MB), 200)
+        return max(int(_KEYPOINTS * self.size_mb / RECORDING_MB), 200)
 
     def facts(self, points_source: int, points_target: int) -> dict[str, float | int]:
         """Return what the limits do to a run, for its record.

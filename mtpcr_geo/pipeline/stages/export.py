@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import Field
 
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.core.recorder import NullRecorder
+from mtpcr_geo.core.recorder import LEAST_RECORDING_MB, RECORDING_MB, NullRecorder
 from mtpcr_geo.core.system import command_line, peak_memory_mb
 from mtpcr_geo.core.types import Pair, Side, Verdict
 from mtpcr_geo.crs.chain import TransformChain
-from mtpcr_geo.export.recording.budget import DEFAULT_MB, LEAST_MB, Budget
+from mtpcr_geo.export.recording.budget import Budget
 from mtpcr_geo.pipeline.options import Force
 from mtpcr_geo.pipeline.records import Written
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
@@ -294,8 +294,8 @@ class RecordingOptions(FileOptions):
     """Options of mtpcr.write_recording."""
 
     size_mb: float = Field(
-        DEFAULT_MB,
-        ge=LEAST_MB,
+        RECORDING_MB,
+        ge=LEAST_RECORDING_MB,
         description="size that the file may have, megabytes: points and pictures are thinned to it",
     )
 

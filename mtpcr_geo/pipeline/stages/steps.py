@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, get_args
 
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.export.recording.budget import DEFAULT_MB
+from mtpcr_geo.core.recorder import RECORDING_MB
 from mtpcr_geo.io.file_cloud import FileCloud
 from mtpcr_geo.io.formats import LAS_ENDINGS, files_at
 from mtpcr_geo.io.las import LasCloud
@@ -271,7 +271,7 @@ def writers_of(
     *,
     force: bool,
     recorded: bool = False,
-    recording_mb: float = DEFAULT_MB,
+    recording_mb: float = RECORDING_MB,
     recording: Path | None = None,
     parts: Sequence[str] = (),
     scale: float | None = None,
