@@ -113,7 +113,7 @@ def test_millimetres_are_named(cases):
     assert unit.role == "source"
     assert "--source-unit mm" in unit.fix
     assert "raster-size" not in codes(report)
-    with pytest.raises(InputError, match="--source-unit mm"):
+    with pytest.raises(InputError, match='source_unit="mm"'):
         mg.register(*files, local=True)
     report = check_clouds(*files, local=True, source_unit="mm")
     assert report.exit_code == 0

@@ -31,9 +31,14 @@ from mtpcr_geo.pipeline.records import InputFile, RunFacts
 from mtpcr_geo.pipeline.runner import RunResult
 from mtpcr_geo.registration import Registration
 
-WITHOUT_RECORDING = {
-    "bev/source.tif", "bev/target.tif", "bev/registered.tif", "ties.gpkg", "transform.json",
-    "transform.cloudcompare.txt", "transform.pdal.json", "report.html", "run.json", "registered.laz",
+UNSOLVED = {
+    "bev/source.tif", "bev/target.tif", "bev/source.qml", "bev/target.qml", "project.qgz", "report.html",
+    "run.json",
+}  # fmt: skip
+WITHOUT_RECORDING = UNSOLVED | {
+    "bev/registered.tif", "bev/registered.qml", "bev/difference.tif", "bev/difference.qml",
+    "bev/source.tif.points", "ties.gpkg", "transform.json",
+    "transform.cloudcompare.txt", "transform.pdal.json", "registered.laz",
 }  # fmt: skip
 # run by run these differ: they tell the time
 TIMED = {"report.html", "run.json", "ties.gpkg", "audit.rrd"}
@@ -183,9 +188,7 @@ def test_a_refused_transform_is_not_used_unless_forced(tmp_path):
     assert registration.apply(points, force=True).shape == (1, 3)
     assert of_pair(make_pair(verdict="refused"), force=True).inverse(points).shape == (1, 3)
     registration.save(tmp_path / "evidence")
-    assert names_below(tmp_path / "evidence") == {
-        "bev/source.tif", "bev/target.tif", "ties.gpkg", "report.html", "run.json",
-    }  # fmt: skip
+    assert names_below(tmp_path / "evidence") == UNSOLVED | {"ties.gpkg"}
     registration.save(tmp_path / "forced", force=True)
     assert {"registered.laz", "transform.json"} <= names_below(tmp_path / "forced")
 
@@ -204,7 +207,7 @@ def test_nothing_found_is_refused_and_no_error(town_files, monkeypatch, tmp_path
         found.apply(np.zeros((1, 3)))
     assert found.plot().axes
     found.save(tmp_path / "out")
-    assert names_below(tmp_path / "out") == {"bev/source.tif", "bev/target.tif", "run.json", "report.html"}
+    assert names_below(tmp_path / "out") == UNSOLVED
 
 
 @pytest.mark.parametrize(

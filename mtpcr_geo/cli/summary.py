@@ -44,7 +44,7 @@ _OPEN_WITH = {
     "run": "everything as numbers",
 }
 # outputs that are named by their folder, by how their names begin
-_OPEN_FOLDERS = {"bev_": "height rasters, in QGIS"}
+_OPEN_FOLDERS = {("bev_", "style_", "points"): "height rasters, in QGIS"}
 
 
 def print_registration(

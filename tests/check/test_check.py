@@ -121,7 +121,7 @@ def test_one_cloud_alone(good, tmp_path):
     assert check_clouds(bare).exit_code == 6
     for words in ({"source_crs": "EPSG:25832"}, {"target_crs": "EPSG:25832"}, {"local": True}):
         assert check_clouds(bare, **words).goes_on
-    with pytest.raises(OptionError, match="target-crs"):
+    with pytest.raises(OptionError, match="target_crs"):
         check_clouds(bare, source_crs="local", target_crs="local")
 
 

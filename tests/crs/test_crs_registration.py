@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import itertools
 import json
 from pathlib import Path
@@ -161,8 +162,8 @@ REFUSED = [
     (PLAIN["metres"], LEVELLED["compound"], "heights do not go together"),
     (ELLIPSOIDAL["geographic 3D"], PLAIN["metres"], "heights do not go together"),
     (ELLIPSOIDAL["geocentric"], Variant(compound(UTM, CRS.from_epsg(5703)), UTM), "NAVD88"),
-    (Variant(None), PLAIN["metres"], "--source-crs"),
-    (PLAIN["metres"], Variant(None), "--target-crs"),
+    (Variant(None), PLAIN["metres"], 'source_crs="'),
+    (PLAIN["metres"], Variant(None), 'target_crs="'),
 ]
 
 
@@ -304,7 +305,9 @@ def test_an_estimated_height_offset_is_told_everywhere(small: Sides, tmp_path: P
     run_json = json.loads(found.outputs["run"].read_text())
     assert run_json["metrics"]["vertical_offset_m"] == offset
     assert json.loads(found.outputs["transform"].read_text())["motion"]["vertical_offset_m"] == offset
-    assert f"{offset:+.3f} m, added to the source&#x27;s heights" in found.outputs["report"].read_text()
+    assert f"{offset:+.3f} m, added to the source's heights" in html.unescape(
+        found.outputs["report"].read_text()
+    )
 
 
 def test_report_and_run_name_frames_and_units(in_feet: tuple[Registration, Path]) -> None:

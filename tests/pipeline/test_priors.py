@@ -120,7 +120,17 @@ def test_options_that_do_not_go_together_are_one_line(options, says):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(("options", "says"), WRONG[:3])
+IN_A_PIPELINE = [
+    (
+        WRONG[0][0],
+        '"near" of mtpcr.match and "prior": "georef" of mtpcr.match both say where the source lies',
+    ),
+    (WRONG[1][0], '"near" of mtpcr.match and "prior" of mtpcr.match file both say where the source lies'),
+    (WRONG[2][0], '"yaw" of mtpcr.match and "prior" of mtpcr.match file both say how the source is turned'),
+]
+
+
+@pytest.mark.parametrize(("options", "says"), IN_A_PIPELINE)
 def test_pipelines_refuse_the_same(options, says, files):
     scan, tile = files
     stages = [str(tile), str(scan), {"type": "mtpcr.level", "source_crs": "local"}, "mtpcr.bev"]
@@ -338,7 +348,7 @@ def test_check_says_where_a_place_lies(site, files):
     (finding,) = [one for one in report.findings if one.code == "near"]
     assert (finding.severity, report.exit_code) == ("warning", 0)
     assert "30 m outside the target" in finding.what
-    with pytest.raises(OptionError, match="of use with --near only"):
+    with pytest.raises(OptionError, match="of use with near only"):
         check_clouds(*files, within=10.0)
     with pytest.raises(OptionError, match="there is one cloud"):
         check_clouds(files[1], near=(1.0, 2.0))

@@ -18,6 +18,7 @@ from rich.console import Console
 from mtpcr_geo.cli.summary import print_registration
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.export import descriptions
+from mtpcr_geo.export.recording.budget import Budget
 from mtpcr_geo.export.recording.writer import RecordingWriter
 from mtpcr_geo.pipeline.runner import RunResult
 from mtpcr_geo.registration import Registration
@@ -60,7 +61,7 @@ def recorded(pair: Pair, path: Path) -> str:
     """The summary that a recording begins with, as the viewer gets it."""
     from rerun.chunk import RrdReader
 
-    writer = RecordingWriter(path, 500, 0)
+    writer = RecordingWriter(path, Budget(1.0), 0)
     writer.begin({})
     writer.after("mtpcr.assess", "assess", {}, pair, 0.1)
     writer.close()

@@ -83,7 +83,7 @@ def test_blocks_are_cloud_optimised(built: Survey) -> None:
     with rasterio.open(built.mosaic.path_of(built.mosaic.places()[0])) as opened:
         assert opened.overviews(1) == list(FACTORS[1:])
         assert opened.shape == (BLOCK_CELLS, BLOCK_CELLS)
-        assert opened.profile["tiled"]
+        assert opened.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
 
 
 def test_the_index_is_a_virtual_point_cloud(built: Survey, tiles: list[Path]) -> None:
