@@ -105,7 +105,9 @@ def demo(tmp_path_factory) -> Path:
 
 def colours(path: Path) -> np.ndarray:
     """(n, 3) colours of a picture, red first, that are not white."""
-    picture = cv2.imread(str(path))[..., ::-1].reshape(-1, 3)
+    seen = cv2.imread(str(path))
+    assert seen is not None
+    picture = seen[..., ::-1].reshape(-1, 3)
     return picture[(picture < 250).any(axis=1)]
 
 
