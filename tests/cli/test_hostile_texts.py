@@ -69,6 +69,7 @@ def hostile_files(town_files, tmp_path_factory) -> tuple[Path, Path]:
     return paths[0], paths[1]
 
 
+@pytest.mark.slow
 def test_names_in_clouds_reach_nothing_that_is_looked_at(hostile_files, tmp_path):
     source, target = hostile_files
     out = tmp_path / f"o{HOSTILE}"
