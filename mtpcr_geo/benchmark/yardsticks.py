@@ -137,7 +137,16 @@ def pdal_bev(path: str, out: str) -> None:
 
 def pdal_move(path: str, out: str) -> None:
     """Move a file by PDAL's filters.transformation, in its streaming mode."""
-    writer = {"type": "writers.las", "filename": out, "minor_version": 4, "forward": "all"}
+    import laspy
+    import numpy as np
+
+    with laspy.open(path) as file:
+        middle = (file.header.mins + file.header.maxs) / 2
+    T = np.array(MOVE.split(), np.float64).reshape(4, 4)
+    # offsets of the place that the cloud came from would not hold it where it goes
+    there = np.floor(T[:3, :3] @ middle + T[:3, 3])
+    offsets = {f"offset_{axis}": float(value) for axis, value in zip("xyz", there, strict=True)}
+    writer = {"type": "writers.las", "filename": out, "minor_version": 4, "forward": "all", **offsets}
     _stream([path, {"type": "filters.transformation", "matrix": MOVE}, {**writer, "compression": "laszip"}])
 
 
