@@ -257,33 +257,6 @@ def _regrid(grid: Grid, margin_m: float, cell: float) -> Grid:
     return Grid(float(grid.west) - margin_m, float(grid.north) + margin_m, cell, width, height)
 
 
-def edge_overlay(source: Bev, target: Bev) -> Picture:
-    """Return height steps of both on one grid: target grey with blue steps, source's steps in orange.
-
-    Where the registration holds, orange runs along blue.
-    """
-    shade = hillshade(target.top, target.grid.cell).astype(np.float32)
-    base = np.where(np.isfinite(target.top), 60.0 + 0.5 * shade, EMPTY_RGB[2])
-    out = np.repeat(base[..., None], 3, axis=2)
-    for bev, colour, opacity in ((target, TARGET_RGB, 0.8), (source, SOURCE_RGB, 0.85)):
-        edges = step_edges(bev.top)[..., None] * opacity
-        out = out * (1.0 - edges) + np.array(colour, np.float64) * edges
-    return np.asarray(np.clip(out, 0, 255), np.uint8)
-
-
-def checkerboard(source: Bev, target: Bev, tile_m: float = 20.0) -> Picture:
-    """Return source (orange) and target (blue) in turn, square by square, on one grid."""
-    grid = target.grid
-    rows, columns = np.indices(grid.shape) * grid.cell // tile_m
-    of_source = ((rows + columns) % 2 == 0)[..., None]
-    tints = []
-    for bev, colour in ((source, SOURCE_RGB), (target, TARGET_RGB)):
-        shade = hillshade(bev.top, grid.cell).astype(np.float32)[..., None] / 255.0
-        tint = np.array(colour, np.float32) * 0.5 + 127.0
-        tints.append(np.where(np.isfinite(bev.top)[..., None], shade * tint, np.array(EMPTY_RGB)))
-    return np.asarray(np.clip(np.where(of_source, tints[0], tints[1]), 0, 255), np.uint8)
-
-
 def step_edges(top: Image) -> Floats:
     """Return height steps as (h, w) 0..1: the range within 3x3 filled cells, from 1 m (0) to 4 m (1)."""
     import cv2

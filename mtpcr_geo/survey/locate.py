@@ -23,7 +23,7 @@ from mtpcr_geo.method.levelling import level
 from mtpcr_geo.pipeline.options import RegisterOptions
 from mtpcr_geo.pipeline.stage import RunContext
 from mtpcr_geo.pipeline.stages.priors import known_place, prior_of
-from mtpcr_geo.pipeline.stages.rasters import in_work_frame, rasterised
+from mtpcr_geo.pipeline.stages.rasters import in_work_frame, rasterised, side_of
 from mtpcr_geo.survey.index import Survey
 from mtpcr_geo.survey.levels import Ground
 from mtpcr_geo.survey.search import FoundPlace, search
@@ -105,19 +105,7 @@ def _pair(source: Cloud, survey: Survey, options: RegisterOptions, progress: Pro
     )
     sample = in_work_frame(source_link, scanned.sample)
     levelling = level(sample, options.level, source_link.georeferenced, options.seed)
-    side = Side(
-        "source",
-        source,
-        source_link,
-        sample,
-        scanned.complete,
-        levelling,
-        bounds=scanned.bounds,
-        no_returns=scanned.no_returns,
-        no_return_places=scanned.no_return_places,
-        strays=scanned.strays,
-        box=scanned.box,
-    )
+    side = side_of("source", source, source_link, scanned, sample, levelling)
     return Pair(Side("target", extent, target_link, target_link.to_work(corners)), side, frame)
 
 

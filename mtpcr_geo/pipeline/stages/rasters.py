@@ -15,7 +15,7 @@ from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import CrsError, InputError, OptionError
 from mtpcr_geo.core.scanner import Scanner, check_unit
-from mtpcr_geo.core.types import Bev, Pair, RasterSettings, Side
+from mtpcr_geo.core.types import Bev, Levelling, Pair, RasterSettings, Side
 from mtpcr_geo.method.bev import (
     Cells,
     Convention,
@@ -45,6 +45,7 @@ from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptio
 
 if TYPE_CHECKING:
     from mtpcr_geo.core.frames import FrameLink, WorkFrame
+    from mtpcr_geo.io.sample import Scan
 
 
 class LevelOptions(StageOptions):
@@ -158,23 +159,43 @@ class Level(Stage):
             remarks = tuple(remark for remark in found_remarks if remark is not None)
             if remarks:
                 self.metadata[role]["header_remarks"] = list(remarks)
-            sides.append(
-                Side(
-                    role,
-                    cloud,
-                    link,
-                    sample,
-                    scanned.complete,
-                    levelling,
-                    bounds=scanned.bounds,
-                    no_returns=scanned.no_returns,
-                    no_return_places=scanned.no_return_places,
-                    strays=scanned.strays,
-                    box=scanned.box,
-                    remarks=remarks,
-                )
-            )
+            side = side_of(role, cloud, link, scanned, sample, levelling)
+            sides.append(replace(side, remarks=remarks))
         return Pair(sides[0], sides[-1], frame)
+
+
+def side_of(
+    role: Literal["source", "target"],
+    cloud: Cloud,
+    link: FrameLink,
+    scanned: Scan,
+    sample: Floats,
+    levelling: Levelling,
+) -> Side:
+    """Return a side of a pair from what was seen of its cloud.
+
+    Args:
+        role: which side it is.
+        cloud: as it was opened.
+        link: between the file's coordinates and the work frame.
+        scanned: what the first pass found.
+        sample: (n, 3) work coordinates, metres.
+        levelling: the rotation that makes it upright.
+
+    """
+    return Side(
+        role,
+        cloud,
+        link,
+        sample,
+        scanned.complete,
+        levelling,
+        bounds=scanned.bounds,
+        no_returns=scanned.no_returns,
+        no_return_places=scanned.no_return_places,
+        strays=scanned.strays,
+        box=scanned.box,
+    )
 
 
 def in_work_frame(link: FrameLink, xyz: Floats) -> Floats:
