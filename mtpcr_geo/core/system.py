@@ -188,3 +188,20 @@ def cores(most: int) -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def opencv_in_one_thread() -> Iterator[None]:
+    """Keep OpenCV from sharing its work among threads meanwhile, in the whole process.
+
+    The search and the pictures are shared among threads by this package; for images of some hundred cells
+    a side OpenCV's own threads cost more than they save.
+    """
+    import cv2
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

@@ -17,6 +17,8 @@ FEWEST_POINTS = 1_000
 """Points below which nothing is usual enough for anything to be called a stray."""
 BODY = (1.0, 99.0)
 """Percentiles of each coordinate between which the body of a cloud lies."""
+BODY_POINTS = 200_000
+"""Points, evenly chosen of all, that tell where the body lies."""
 BEYOND = 1.0
 """Sizes of the body from its edge, on each axis, within which no point is a stray."""
 FLATTEST = 0.05
@@ -38,7 +40,7 @@ def stray_box(xyz: Floats) -> Floats | None:
     """
     if len(xyz) < FEWEST_POINTS:
         return None
-    low, high = np.percentile(xyz, BODY, axis=0)
+    low, high = np.percentile(xyz[:: max(1, len(xyz) // BODY_POINTS)], BODY, axis=0)
     size = high - low
     size[:2] = size[:2].max()
     size[2] = max(size[2], FLATTEST * size[0])

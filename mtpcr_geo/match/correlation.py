@@ -16,6 +16,7 @@ import numpy as np
 
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
+from mtpcr_geo.core.system import opencv_in_one_thread
 from mtpcr_geo.core.types import Bev, Matches
 from mtpcr_geo.match.exploration import (
     CLEAR_LEAD,
@@ -65,6 +66,18 @@ def match(
     """
     if prior is None and (source.count > 0).sum() > (target.count > 0).sum():
         return exchanged(match(target, source, settings, seed, advance))
+    with opencv_in_one_thread():
+        return _match(source, target, settings, seed, advance, prior)
+
+
+def _match(
+    source: Bev,
+    target: Bev,
+    settings: CorrelationSettings,
+    seed: int,
+    advance: Callable[[int], object],
+    prior: Prior | None,
+) -> Matches:
     scales = scales_of(source, target)
     search = Exploration(source, target, scales, settings, seed, advance, prior)
     twin = None

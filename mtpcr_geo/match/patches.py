@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from mtpcr_geo.core.arrays import Floats, Image
+from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.match.pose import Pose, source_from_target_pixels, warp_to
 from mtpcr_geo.match.search import FILLED, Layer, correlation_score
 
@@ -90,15 +92,22 @@ def match_patches(
     shape = (height // stride - 1, width // stride - 1)
     sums = np.empty((7, side * side, shape[0] * shape[1]), np.float32)
     aa, ee, AA, EE = a * a, e * e, A * A, E * E
-    products = np.empty((7, height, width), np.float32)
-    for shift in range(side * side):
-        dy, dx = divmod(shift, side)
-        place = (slice(dy, dy + height), slice(dx, dx + width))
-        Mp = M[place]
-        pairs = ((m, Mp), (a, A[place]), (e, E[place]), (aa, Mp), (ee, Mp), (m, AA[place]), (m, EE[place]))
-        for product, (one, other) in zip(products, pairs, strict=True):
-            np.multiply(one, other, out=product)
-        sums[:, shift] = _patch_sums(products, stride).reshape(7, -1)
+
+    def sum_rows(dy: int) -> None:
+        """Fill in the sums of all shifts by so many rows."""
+        products = np.empty((7, height, width), np.float32)
+        for dx in range(side):
+            place = (slice(dy, dy + height), slice(dx, dx + width))
+            Mp = M[place]
+            pairs = (
+                (m, Mp), (a, A[place]), (e, E[place]), (aa, Mp), (ee, Mp), (m, AA[place]), (m, EE[place])
+            )  # fmt: skip
+            for product, (one, other) in zip(products, pairs, strict=True):
+                np.multiply(one, other, out=product)
+            sums[:, dy * side + dx] = _patch_sums(products, stride).reshape(7, -1)
+
+    with ThreadPoolExecutor(usable_cores()) as threads:
+        list(threads.map(sum_rows, range(side)))
     overlap = sums[0]
     values = correlation_score(overlap, (sums[1], sums[2]), (sums[3], sums[4]), (sums[5], sums[6]))
     score = (values / np.sqrt(np.maximum(overlap, 1.0)) / 2).reshape(side, side, *shape)

@@ -19,6 +19,8 @@ from mtpcr_geo.core.types import Solution, SolveSettings, TiePoints
 from mtpcr_geo.core.wording import only
 
 DEFAULTS = SolveSettings()
+NUMBERS_AT_A_TIME = 32_768
+"""Residuals computed at a time: as many as stay in a core's own cache."""
 
 
 def fit_rigid(source: Floats, target: Floats, weight: Floats | None = None) -> Floats:
@@ -109,18 +111,24 @@ def ransac_upright(
 def _most_agreed(s: Floats, t: Floats, yaw: Floats, anchor: NDArray[np.int64], tolerance: float) -> Mask:
     """Mark the tie points that agree with the best of many poses, each exact at one tie point."""
     best, best_count = np.zeros(len(s), bool), -1
-    # a few million numbers at a time
-    step = max(1, 2_000_000 // len(s))
+    x, y, to_east, to_north = np.ascontiguousarray(np.hstack([s, t]).T)
+    step = max(1, NUMBERS_AT_A_TIME // len(s))
     for start in range(0, len(yaw), step):
         c, r = np.cos(yaw[start : start + step, None]), np.sin(yaw[start : start + step, None])
         i = anchor[start : start + step]
-        east = c * s[:, 0] - r * s[:, 1] - t[:, 0]
-        north = r * s[:, 0] + c * s[:, 1] - t[:, 1]
         rows = np.arange(len(i))
+        east, north = c * x, r * x
+        east -= r * y
+        east -= to_east
+        north += c * y
+        north -= to_north
         east -= east[rows, i][:, None]
         north -= north[rows, i][:, None]
-        agree = east * east + north * north < tolerance**2
-        counts = agree.sum(axis=1)
+        east *= east
+        north *= north
+        east += north
+        agree = east < tolerance**2
+        counts = np.count_nonzero(agree, axis=1)
         k = int(np.argmax(counts))
         if counts[k] > best_count:
             best, best_count = agree[k], int(counts[k])

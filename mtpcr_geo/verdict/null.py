@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import gammaincinv
+from numpy.polynomial.laguerre import laggauss
 
 TAIL = 10
 """Strongest distinct hypotheses of the mirrored source that the tail is fitted to."""
 FEWEST = 3
 LEAST_SCALE = 1e-3
-STEPS = 400
+NODES = 80
+"""Points of the Gauss-Laguerre quadrature: beyond them the result no longer changes by a millionth."""
 
 
 def null_probability(strength: float | None, mirrored: Sequence[float] | None) -> float | None:
@@ -43,6 +44,7 @@ def null_probability(strength: float | None, mirrored: Sequence[float] | None) -
     base, above = logs[-1], logs[:-1]
     k = len(above)
     total = max(float((above - base).sum()), LEAST_SCALE * k)
-    u = gammaincinv(k, (np.arange(STEPS) + 0.5) / STEPS)
+    u, weight = laggauss(NODES)
+    weight = weight * u ** (k - 1)
     beyond = np.exp(np.minimum(-u * (np.log(strength) - base) / total, 50.0))
-    return float(-np.expm1(-(k + 1) * np.log1p(beyond)).mean())
+    return float(-np.expm1(-(k + 1) * np.log1p(beyond)) @ weight / weight.sum())

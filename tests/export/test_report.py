@@ -75,7 +75,7 @@ def test_one_whole_file_without_a_network(tmp_path, verdict):
     assert parser.open == []
     assert parser.fetched.pop(0) == "data:,"  # no icon is asked for
     assert len(parser.fetched) == 10
-    assert all(re.match("data:image/(webp|png);base64,", source) for source in parser.fetched)
+    assert all(re.match("data:image/(webp|png|jpeg);base64,", source) for source in parser.fetched)
     for source in parser.fetched:
         picture = cv2.imdecode(np.frombuffer(base64.b64decode(source.split(",")[1]), np.uint8), -1)
         assert picture is not None

@@ -31,7 +31,7 @@ _KINDS = ("disagreeing", "agreeing", "held_out", "unjudged")
 
 
 class RecordingWriter:
-    """Logs a run to an open rerun file. All calls come from one thread.
+    """Logs a run to memory, and writes it as a rerun file in the end. All calls come from one thread.
 
     Args:
         path: the `.rrd` to write.
@@ -58,7 +58,8 @@ class RecordingWriter:
         # one clock only: the stages
         rr.set_log_time_enabled(False, recording=self._stream)
         rr.set_log_tick_enabled(False, recording=self._stream)
-        self._stream.save(path)
+        # rerun's own writer waits for ever once the disk is full; this is a few megabytes
+        self._path, self._memory = path, self._stream.memory_recording()
         for root in ("input/source", "input/target", "levelled", "aligned"):
             self._stream.log(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
@@ -109,8 +110,9 @@ class RecordingWriter:
         if self._pair is not None:
             self._recorded.looks = looks_of(self._pair, self._recorded.images)
         self._stream.send_blueprint(layout(self._recorded), make_active=True, make_default=True)
-        self._stream.flush()
+        data = self._memory.drain_as_bytes()
         self._stream.disconnect()
+        self._path.write_bytes(data)
 
     def _log_pair(self, pair: Pair) -> None:
         self._pair = pair

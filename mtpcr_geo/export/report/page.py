@@ -5,7 +5,8 @@ from __future__ import annotations
 import base64
 import datetime
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from mtpcr_geo.core.errors import OutputError
+from mtpcr_geo.core.system import opencv_in_one_thread, usable_cores
 from mtpcr_geo.core.types import Check, Pair, Verdict
 from mtpcr_geo.core.version import __version__
 from mtpcr_geo.core.wording import visible
@@ -104,21 +106,30 @@ def _pictures(pair: Pair) -> dict[str, Any]:
     both = pair.source.bev is not None and pair.target.bev is not None
     found: dict[str, Any] = dict.fromkeys(("zoom", "swipe", "difference"))
     found |= {"sections": (), "patches": (), "reliefs": ()}
+    of_pair: dict[str, Callable[[Pair], Any]] = {
+        "rivals": figures.rivals,
+        "ties": ties.tie_plots,
+        "matched": figures.matched,
+        "error_map": figures.error_map,
+    }
+    of_overlay: dict[str, Callable[[Overlay], Any]] = {}
+    overlay = None
     if both and pair.T_target_source is not None:
+        of_pair = {"swipe": figures.swipe, **of_pair}
         overlay = Overlay(pair)
-        found["swipe"] = figures.swipe(pair)
         if overlay.shared.any():
-            found["zoom"] = figures.overlap_zoom(overlay)
-            found["difference"] = figures.difference(overlay)
-            found["sections"] = figures.cross_sections(overlay)
-            found["patches"] = figures.patches(overlay)
+            of_overlay = {
+                "zoom": figures.overlap_zoom,
+                "difference": figures.difference,
+                "sections": figures.cross_sections,
+                "patches": figures.patches,
+            }
     else:
-        found["reliefs"] = figures.reliefs(pair)
-    found["rivals"] = figures.rivals(pair)
-    found["ties"] = ties.tie_plots(pair)
-    found["matched"] = figures.matched(pair)
-    found["error_map"] = figures.error_map(pair)
-    return found
+        of_pair["reliefs"] = figures.reliefs
+    with ThreadPoolExecutor(usable_cores()) as threads, opencv_in_one_thread():
+        drawn = {name: threads.submit(draw, overlay) for name, draw in of_overlay.items()}
+        drawn |= {name: threads.submit(draw, pair) for name, draw in of_pair.items()}
+        return found | {name: future.result() for name, future in drawn.items()}
 
 
 def _verdict(verdict: Verdict | None) -> dict[str, Any] | None:

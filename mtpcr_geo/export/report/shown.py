@@ -125,7 +125,10 @@ def css_of(rgb: Sequence[int]) -> str:
 
 
 def data_uri(picture: drawing.Picture, *, exact: bool = False) -> str:
-    """Return a picture as a data URI: a WebP file, or a PNG file where it must be exact.
+    """Return a picture as a data URI.
+
+    It is a PNG file where it must be exact, a WebP file where it has transparent parts, and else a JPEG
+    file: WebP is half the size, and takes thirty times as long.
 
     Args:
         picture: (h, w), (h, w, 3) RGB or (h, w, 4) RGBA.
@@ -135,9 +138,13 @@ def data_uri(picture: drawing.Picture, *, exact: bool = False) -> str:
     if picture.ndim == 3:
         order = [2, 1, 0, 3] if picture.shape[2] == 4 else [2, 1, 0]
         picture = np.ascontiguousarray(picture[..., order])
-    suffix, kind = (".png", "png") if exact else (".webp", "webp")
-    options = [cv2.IMWRITE_PNG_COMPRESSION, 6] if exact else [cv2.IMWRITE_WEBP_QUALITY, _QUALITY]
-    good, data = cv2.imencode(suffix, picture, options)
+    if exact:
+        kind, options = "png", [cv2.IMWRITE_PNG_COMPRESSION, 6]
+    elif picture.ndim == 3 and picture.shape[2] == 4:
+        kind, options = "webp", [cv2.IMWRITE_WEBP_QUALITY, _QUALITY]
+    else:
+        kind, options = "jpeg", [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    good, data = cv2.imencode(f".{kind}", picture, options)
     if not good:
         raise ValueError(f"a picture of shape {picture.shape} cannot be encoded as {kind}")
     return f"data:image/{kind};base64," + base64.b64encode(bytes(data)).decode("ascii")
