@@ -136,3 +136,8 @@ def bounds(xyz: Points) -> tuple[Points, Points]:
     """
     columns = range(xyz.shape[1])
     return np.array([xyz[:, i].min() for i in columns]), np.array([xyz[:, i].max() for i in columns])
+
+
+def centroid(xyz: Points) -> Points:
+    """Return the mean of (n, k) points, (k,); column by column, like `bounds`."""
+    return np.array([xyz[:, i].mean() for i in range(xyz.shape[1])])

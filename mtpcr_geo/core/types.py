@@ -180,6 +180,8 @@ class Side(ComparesArrays):
     @property
     def levelled_sample(self) -> Floats:
         """The sample in levelled coordinates, (n, 3) metres."""
+        if np.array_equal(self.T_level_work, np.eye(4)):
+            return self.sample
         return transforms.apply(self.T_level_work, self.sample)
 
 

@@ -47,7 +47,7 @@ class TransformChain(ComparesArrays):
             raise ValueError("the pair has no transform yet")
         link, cloud = pair.source.link, pair.source.cloud
         sample = pair.source.sample
-        centre = sample.mean(axis=0) if len(sample) else np.zeros(3)
+        centre = transforms.centroid(sample) if len(sample) else np.zeros(3)
         return cls(
             source=link,
             target=pair.frame.output or pair.target.link,

@@ -108,7 +108,7 @@ def side_rows(side: Side) -> list[Row]:
     """Return the facts of a cloud: file, points, CRS, extent, levelling, raster."""
     cloud = side.cloud
     crs = side.link.file_crs.name if side.link.file_crs is not None else "none (local coordinates)"
-    extent = np.ptp(side.sample, axis=0) if len(side.sample) else np.zeros(3)
+    extent = np.subtract(*transforms.bounds(side.sample)[::-1]) if len(side.sample) else np.zeros(3)
     rows = [
         ("file", Path(cloud.name).name),
         ("points", f"{cloud.count:,}"),

@@ -206,9 +206,11 @@ def _hypotheses(pair: Pair) -> Layer:
     some = transforms.apply(pair.source.T_level_work, pair.source.sample[::step])[:, :2]
     T_work_levelled = transforms.inverse(pair.target.T_level_work)
     height = float(np.median(pair.target.sample[:: max(1, len(pair.target.sample) // 10_000), 2]))
+    covered = transforms.bounds(pair.target.levelled_sample)
     places = []
     for one in every:
-        plan = _shared_middle(pair, some @ transforms.yaw_matrix(one.yaw)[:2, :2].T + np.asarray(one.shift))
+        moved = some @ transforms.yaw_matrix(one.yaw)[:2, :2].T + np.asarray(one.shift)
+        plan = _shared_middle(pair, moved, covered)
         work = transforms.apply(T_work_levelled, np.array([[plan[0], plan[1], height]]))
         places.append(work + pair.frame.origin)
     fields: Fields = {
@@ -223,12 +225,18 @@ def _hypotheses(pair: Pair) -> Layer:
     return Layer("hypotheses", "POINT", places, fields, about)
 
 
-def _shared_middle(pair: Pair, plan: Floats) -> Floats:
+def _shared_middle(pair: Pair, plan: Floats, covered: tuple[Floats, Floats]) -> Floats:
     """Return the middle of those of (n, 2) levelled target coordinates that the target covers, metres.
 
     A pose may put the middle of a long source far from all that is drawn; what it would share is not.
+
+    Args:
+        pair: whose target it is.
+        plan: (n, 2) the coordinates.
+        covered: least and greatest levelled coordinates of the target, (3,) each.
+
     """
-    low, high = transforms.bounds(pair.target.levelled_sample)
+    low, high = covered
     bev = pair.target.bev
     if bev is None:
         inside = np.all((plan >= low[:2]) & (plan <= high[:2]), axis=1)

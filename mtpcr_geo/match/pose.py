@@ -64,8 +64,12 @@ def warp_to(source: Image, source_grid: Grid, target_grid: Grid, pose: Pose) -> 
 
     """
     M = source_from_target_pixels(source_grid, target_grid, pose)
+    return warp(source, M, (target_grid.width, target_grid.height))
+
+
+def warp(source: Image, M: Floats, size: tuple[int, int]) -> Image:
+    """Sample (k, h, w) images bilinearly where a (2, 3) map puts the pixels of an image of a size."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    size = (target_grid.width, target_grid.height)
     return np.stack([cv2.warpAffine(image, M, size, flags=flags) for image in source])
 
 

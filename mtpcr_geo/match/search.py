@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mtpcr_geo.core.arrays import Image
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.system import usable_cores
-from mtpcr_geo.match.pose import Pose, centre_of, warp_to
+from mtpcr_geo.match.pose import Pose, centre_of, source_from_target_pixels, warp, warp_to
 from mtpcr_geo.method.images import Channels
 
 HEIGHT_FLOOR_M = 0.1
@@ -244,16 +244,18 @@ def score_nearby(
     nothing = np.full((side, side), -np.inf, np.float32)
     if part.width <= 2 * window or part.height <= 2 * window:
         return Pose(pose.yaw, pose.east, pose.north, -np.inf, 0), nothing
-    warped = warp_to(source.channels.stack, source.grid, part, pose)
-    inner = (slice(window, part.height - window), slice(window, part.width - window))
-    mask = (warped[2] > FILLED).astype(np.float32)[inner]
+    by_spectra = window >= SPECTRAL_WINDOW
+    cells = (part.height - side + 1) * (part.width - side + 1)
+    step = 1 if by_spectra else max(1, int(cells / max_cells))
+    warped = _warp_rows(source, part, pose, window, step)
+    mask = (warped[2] > FILLED).astype(np.float32)
     row0, column0 = offset
     stack = target.channels.stack[:, row0 : row0 + part.height, column0 : column0 + part.width]
-    a, e = warped[0][inner] * mask, warped[1][inner] * mask
-    if window >= SPECTRAL_WINDOW:
+    a, e = warped[0] * mask, warped[1] * mask
+    if by_spectra:
         sums = _sums_by_spectra(a, e, mask, stack, window)
     else:
-        sums = _sums_by_shifts(a, e, mask, stack, window, max(1, int(mask.size / max_cells)))
+        sums = _sums_by_shifts(a, e, mask, stack, window, step)
     overlap = sums[0]
     score = correlation_score(overlap, (sums[1], sums[2]), (sums[3], sums[4]), (sums[5], sums[6]))
     best_dy, best_dx = divmod(int(np.argmax(score)), side)
@@ -269,23 +271,24 @@ def score_nearby(
 
 
 def _sums_by_shifts(a: Image, e: Image, m: Image, stack: Image, window: int, step: int) -> Image:
-    """Return the (7, n, n) sums that a score is made of, for each shift, from every ``step``-th row.
+    """Return the (7, n, n) sums that a score is made of, for each shift.
 
-    The source's rows are filled up with zeros to the length of the target's: a shift is then a place in the
-    target's cells laid end to end, and none is copied for it.
+    The source's images hold every ``step``-th row of those under the target's. They are filled up with
+    zeros to the length of the target's: a shift is then a place in the target's cells laid end to end, and
+    none is copied for it.
     """
-    rows, columns = m.shape
+    columns = m.shape[1]
     side, width = 2 * window + 1, stack.shape[2]
-    length = (len(range(0, rows, step)) - 1) * width + columns
-    source = np.zeros((5, -(-rows // step), width), np.float32)
+    rows = stack.shape[1] - side + 1
+    length = (len(m) - 1) * width + columns
+    source = np.zeros((5, len(m), width), np.float32)
     for row, image in zip(source, (m, a, e, a * a, e * e), strict=True):
-        row[:, :columns] = image[::step]
+        row[:, :columns] = image
     m, a, e, aa, ee = source.reshape(5, -1)[:, :length]
-    A, E, M = stack
-    target = np.stack([M, A, E, A * A, E * E])
     sums = np.empty((7, side, side), np.float32)
     for dy in range(side):
-        M, A, E, AA, EE = np.ascontiguousarray(target[:, dy : dy + rows : step]).reshape(5, -1)
+        A, E, M = np.ascontiguousarray(stack[:, dy : dy + rows : step]).reshape(3, -1)
+        AA, EE = A * A, E * E
         for dx in range(side):
             at = slice(dx, dx + length)
             sums[:, dy, dx] = (
@@ -298,6 +301,14 @@ def _sums_by_shifts(a: Image, e: Image, m: Image, stack: Image, window: int, ste
                 m @ EE[at],
             )
     return np.asarray(sums * np.float32(step))
+
+
+def _warp_rows(source: Layer, part: Grid, pose: Pose, margin: int, step: int) -> Image:
+    """Bring the source's channels onto every ``step``-th row of a part of a grid, without its rim."""
+    M = source_from_target_pixels(source.grid, part, pose)
+    M = np.column_stack([M[:, 0], step * M[:, 1], M[:, 2] + margin * (M[:, 0] + M[:, 1])])
+    size = (part.width - 2 * margin, -(-(part.height - 2 * margin) // step))
+    return warp(source.channels.stack, M, size)
 
 
 def _sums_by_spectra(a: Image, e: Image, m: Image, stack: Image, window: int) -> Image:

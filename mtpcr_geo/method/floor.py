@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mtpcr_geo.core.arrays import Floats
-from mtpcr_geo.core.transforms import angle_deg, rotation_to_up
+from mtpcr_geo.core.transforms import angle_deg, centroid, rotation_to_up
 from mtpcr_geo.method.downsample import one_per_voxel
 
 CELLS_ACROSS = 30
@@ -79,7 +79,7 @@ def floor_along(xyz: Floats, about: Floats, extent: float) -> Floor:
         extent: of the cloud, metres, see `extent_of`.
 
     """
-    xyz = xyz - xyz.mean(axis=0)
+    xyz = xyz - centroid(xyz)
     cell, near = extent / CELLS_ACROSS, extent * NEAR_PER_EXTENT
     up = about
     found = Floor(about, 0, 0.0, float("inf"), extent, 0.5)

@@ -134,7 +134,7 @@ class Surfaces:
         self.T_start = T_start
         self.voxel_m = voxel_m
         self._threads = threads or usable_cores()
-        self._pivot = np.floor(target[of_target].mean(axis=0))
+        self._pivot = np.floor(transforms.centroid(target[of_target]))
         # each cloud is thinned in its own frame, so that a hair's breadth at the start changes no point
         s = transforms.apply(T_start, thinned(source[of_source], of_source, voxel_m, max_points))
         t = thinned(target[of_target], of_target, voxel_m, 3 * max_points)

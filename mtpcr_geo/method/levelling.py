@@ -159,7 +159,7 @@ def _in_order(found: Evidence) -> list[tuple[LevellingMethod, Floats]]:
 
 
 def _levelled(xyz: Floats, up: Floats, found: Levelling) -> Levelling:
-    T = transforms.about(xyz.mean(axis=0), transforms.rotation_to_up(up))
+    T = transforms.about(transforms.centroid(xyz), transforms.rotation_to_up(up))
     return replace(found, T_level_work=T, tilt_deg=_tilt_deg(up))
 
 

@@ -119,7 +119,7 @@ def refine(
         found = _refine(source, target, T_start, settings, cell, agreeing)
     if settings.motion == "rigid":
         return found
-    middle = source.mean(axis=0) if pivot is None else pivot
+    middle = transforms.centroid(source) if pivot is None else pivot
     T = constrain(found.T, settings.motion, middle, np.eye(3) if R_upright is None else R_upright)
     return replace(found, T=T)
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.system import usable_cores
+from mtpcr_geo.core.transforms import centroid
 from mtpcr_geo.method.downsample import one_per_voxel
 from mtpcr_geo.method.neighbourhoods import local_shapes
 
@@ -53,7 +54,7 @@ def ground_plane(
 
     """
     tolerance = float(np.clip(extent / 250.0, 0.1, 0.6))
-    xyz = one_per_voxel(xyz - xyz.mean(axis=0), float(np.clip(extent / 100.0, 0.1, 1.0)), rng, 30_000)
+    xyz = one_per_voxel(xyz - centroid(xyz), float(np.clip(extent / 100.0, 0.1, 1.0)), rng, 30_000)
     few = xyz if len(xyz) <= 4000 else xyz[rng.choice(len(xyz), 4000, replace=False)]
     three = few[rng.integers(0, len(few), (iterations, 3))]
     normal = np.cross(three[:, 1] - three[:, 0], three[:, 2] - three[:, 0])
@@ -112,7 +113,7 @@ def plumb_line(xyz: Floats, about: Floats, extent: float, rng: np.random.Generat
     import small_gicp
 
     nothing = PlumbLine(None, 0, None)
-    xyz = one_per_voxel(xyz - xyz.mean(axis=0), float(np.clip(extent / 50.0, 0.1, 0.4)), rng, 200_000)
+    xyz = one_per_voxel(xyz - centroid(xyz), float(np.clip(extent / 50.0, 0.1, 0.4)), rng, 200_000)
     if len(xyz) < 10 * NEIGHBOURS:
         return nothing
     chosen = xyz if len(xyz) <= SHAPE_POINTS else xyz[rng.choice(len(xyz), SHAPE_POINTS, replace=False)]

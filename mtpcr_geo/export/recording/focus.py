@@ -46,8 +46,8 @@ def overlap_of(pair: Pair) -> Floats | None:
     if T is None or len(pair.source.sample) == 0 or len(pair.target.sample) == 0:
         return None
     placed, target = transforms.apply(T, pair.source.sample), pair.target.sample
-    low = np.maximum(placed[:, :2].min(axis=0), target[:, :2].min(axis=0))
-    high = np.minimum(placed[:, :2].max(axis=0), target[:, :2].max(axis=0))
+    of_placed, of_target = transforms.bounds(placed[:, :2]), transforms.bounds(target[:, :2])
+    low, high = np.maximum(of_placed[0], of_target[0]), np.minimum(of_placed[1], of_target[1])
     if np.any(high <= low):
         return None
     cell = max(float((high - low).max()) / _CELLS, 1e-3)

@@ -286,7 +286,7 @@ def expected_error_picture(
     some = pair.source.sample[:: max(1, len(pair.source.sample) // _ERROR_POINTS)]
     moved = transforms.apply(pair.T_target_source, some)
     level: Floats = (moved - uncertainty.pivot) @ uncertainty.R_level.T
-    low, high = level[:, :2].min(axis=0), level[:, :2].max(axis=0)
+    low, high = transforms.bounds(level[:, :2])
     spacing = float(np.sqrt(np.prod(high - low) / max(len(level), 1)))
     cell = max(float((high - low).max()) / side, 2.0 * spacing, 1e-6)
     width, height = (int(size) + 1 for size in np.floor((high - low) / cell))

@@ -11,8 +11,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.system import opencv_in_one_thread, usable_cores
 from mtpcr_geo.core.types import Check, Pair, Verdict
@@ -21,6 +19,7 @@ from mtpcr_geo.core.wording import visible
 from mtpcr_geo.export import descriptions
 from mtpcr_geo.export.report import facts as told
 from mtpcr_geo.export.report import figures, ties
+from mtpcr_geo.export.report.compiled import ENVIRONMENT, TEMPLATE
 from mtpcr_geo.export.report.pictures import Overlay
 
 
@@ -40,22 +39,11 @@ def write_report(
         OutputError: if the file cannot be written.
 
     """
-    html = _environment().get_template("report.html.j2").render(_content(pair, done, facts))
+    html = TEMPLATE.render(_content(pair, done, facts))
     try:
         Path(path).write_text(visible(html) + "\n", encoding="utf-8")
     except OSError as error:
         raise OutputError(f"cannot write the report {path}: {error.strerror}") from error
-
-
-@cache
-def _environment() -> Environment:
-    # texts from files are escaped wherever they are put
-    return Environment(
-        loader=PackageLoader("mtpcr_geo.export.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        keep_trailing_newline=False,
-    )
 
 
 def _content(pair: Pair, done: Sequence[Mapping[str, Any]], facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -165,6 +153,5 @@ def _check(check: Check) -> dict[str, str]:
 @cache
 def _part(name: str) -> str:
     """Return a part of the page that is no template."""
-    environment = _environment()
-    assert environment.loader is not None
-    return environment.loader.get_source(environment, name)[0].strip()
+    assert ENVIRONMENT.loader is not None
+    return ENVIRONMENT.loader.get_source(ENVIRONMENT, name)[0].strip()

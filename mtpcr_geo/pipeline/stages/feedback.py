@@ -41,7 +41,7 @@ def levelled_by(pair: Pair, T_target_source: Floats) -> Levelling:
     """
     R = (pair.target.T_level_work @ T_target_source)[:3, :3]
     tilt = transforms.yaw_matrix(transforms.yaw_of(R)).T @ R
-    centre = pair.source.sample.mean(axis=0)
+    centre = transforms.centroid(pair.source.sample)
     return replace(
         pair.source.levelling,
         T_level_work=transforms.about(centre, transforms.orthonormal(tilt)),
