@@ -43,6 +43,7 @@ def pairs(town_files: tuple[Path, Path], tmp_path: Path) -> Path:
     return tmp_path / "pairs"
 
 
+@pytest.mark.slow
 def test_benchmark_pairs(pairs: Path, tmp_path: Path) -> None:
     reported = run("benchmark_pairs.py", pairs, "--starts", 1, "--csv", tmp_path / "runs.csv")
     assert "2 runs: 2 accepted" in reported
@@ -50,6 +51,7 @@ def test_benchmark_pairs(pairs: Path, tmp_path: Path) -> None:
     assert len((tmp_path / "runs.csv").read_text().splitlines()) == 3
 
 
+@pytest.mark.slow
 def test_benchmark_matchers(pairs: Path, tmp_path: Path) -> None:
     words = ("--starts", 1, "--matchers", "correlation", "rootsift", "--images", "band_pass", "--only", "a")
     reported = run("benchmark_matchers.py", pairs, *words, "--csv", tmp_path / "runs.csv")

@@ -103,6 +103,7 @@ def test_register_as_json_and_quiet(town_files, tmp_path):
     assert (quiet.exit_code, quiet.output) == (0, "")
 
 
+@pytest.mark.slow
 def test_dump_pipeline_runs_and_gives_the_same_bits(town_files, tmp_path):
     source, target = town_files
     dumped = run(

@@ -56,7 +56,7 @@ def test_a_plot_of_25_m_is_found_at_any_yaw(yaw_deg: float) -> None:
     assert found.null_ratio > 2.0
 
 
-@pytest.mark.parametrize("yaw_deg", [0.0, 77.0])
+@pytest.mark.parametrize("yaw_deg", [pytest.param(0.0, marks=pytest.mark.slow), 77.0])
 def test_the_terrain_tells_one_period_of_a_planting_from_the_next(yaw_deg: float) -> None:
     rng = np.random.default_rng(2)
     T_moved = moved_by(yaw_deg)

@@ -155,7 +155,6 @@ def test_rivals_and_the_mirrored_world_of_the_whole_survey_count() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_a_rival_elsewhere_in_the_survey_counts(source: tuple[Path, np.ndarray], tmp_path: Path) -> None:
     town = town_target()
     tiles = tiles_of(tmp_path / "tiles", town)
