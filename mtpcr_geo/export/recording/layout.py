@@ -82,7 +82,7 @@ def layout(recorded: Recorded) -> Any:
 def _log_columns() -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["LogLevel", "Body"])
+    return rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["Body"])
 
 
 def _overview(recorded: Recorded) -> Any:

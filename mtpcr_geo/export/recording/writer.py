@@ -92,7 +92,7 @@ class RecordingWriter:
             self._log_pair(value)
         bad = "verdict" in made and "accepted" not in made
         level = rr.TextLogLevel.WARN if bad else rr.TextLogLevel.INFO
-        line = f"{tag} ({stage_type}), {seconds:.2f} s: {made}"
+        line = f"{tag}: {made}"  # short: lines of the log are cut off, not wrapped
         self._log("stages", rr.TextLog(visible(line), level=level))
         self._trail.append(
             {"tag": tag, "type": stage_type, "options": options, "seconds": seconds, "made": made}
