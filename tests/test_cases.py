@@ -59,7 +59,7 @@ def test_a_vertical_unit_is_no_datum(cases, other):
     report = check_clouds(*files)
     if other == "f8_navd88":
         assert report.exit_code == 6
-        assert any("--vertical" in finding.fix for finding in report.findings)
+        assert any('vertical="assume-same"' in finding.fix for finding in report.findings)
         report = check_clouds(*files, vertical="assume-same")
     assert report.exit_code == 0
 
@@ -111,7 +111,7 @@ def test_millimetres_are_named(cases):
     assert report.exit_code == 5
     unit = next(finding for finding in report.findings if finding.code == "unit")
     assert unit.role == "source"
-    assert "--source-unit mm" in unit.fix
+    assert 'source_unit="mm"' in unit.fix
     assert "raster-size" not in codes(report)
     with pytest.raises(InputError, match='source_unit="mm"'):
         mg.register(*files, local=True)
@@ -131,7 +131,7 @@ def test_axes_are_named(cases, name, code, axes):
     # also where nothing states that the cloud is local
     for report in (check_clouds(*files, local=True), check_clouds(files[0])):
         found = next(finding for finding in report.findings if finding.code == code)
-        assert f"--source-axes {axes}" in found.fix
+        assert f'source_axes="{axes}"' in found.fix
         assert "z-range" not in codes(report)
     report = check_clouds(*files, local=True, source_axes=axes)
     assert not {"lies-on-its-side", "upside-down", "tilted"} & codes(report)

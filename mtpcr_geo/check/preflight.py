@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ from mtpcr_geo.check import fitness, header, pair, place, points, upright
 from mtpcr_geo.check.describe import CloudFacts, describe
 from mtpcr_geo.check.findings import CloudRole, Finding, Role, by_severity, finding_of
 from mtpcr_geo.check.inspection import Inspection
-from mtpcr_geo.core.advice import python_words
+from mtpcr_geo.core.advice import as_called, python_words
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import CrsError, InputError, MtpcrError, OptionError, RegistrationError
 from mtpcr_geo.core.frames import box_points
@@ -42,7 +42,8 @@ class CheckReport:
     Attributes:
         clouds: facts of each cloud, by role; a file that cannot be opened is not in it.
         relation: where they lie to each other; None for one cloud.
-        findings: errors first.
+        findings: errors first; they name options as keywords of Python, or as the command spells them where
+            it was called.
         files: the file of each cloud that was asked for, by role.
         exit_code: 0 where `register` would go on, else the code with which it would end.
 
@@ -393,10 +394,11 @@ class _Check:
     def report(self) -> CheckReport:
         """Put together what was found."""
         in_order = sorted(self.inspections.items())
+        found = [replace(one, what=as_called(one.what), fix=as_called(one.fix)) for one in self.findings]
         return CheckReport(
             {role: describe(inspection) for role, inspection in in_order},
             self.relation,
-            by_severity(self.findings),
+            by_severity(found),
             dict(sorted(self.files.items())),
             self.refusals[0].exit_code if self.refusals else 0,
         )

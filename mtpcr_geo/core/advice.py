@@ -23,7 +23,20 @@ SWITCHES = frozenset({"local", "force", "overwrite", "allow_code", "allow_networ
 """Options that are on or off, of those that messages name."""
 
 _NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
-_VALUE = rf"EPSG:(?:\.\.\.|\d+)|local(?![\w-])|(?:georef|paper|mm|cm|ft|us-ft)(?!\w)|{_NUMBER}|[XY](?!\w)"
+_WORDS = {
+    "unit": "m|mm|cm|dm|km|in|ft|us-ft|yd",
+    "axes": "[xyz]-(?:up|down)",
+    "vertical": "refuse|assume-same|estimate",
+    "level": "auto|ransac|none",
+    "profile": "default|paper",
+    "motion": "rigid|yaw|translation",
+    "also": r"input|ply|pcd|xyz|csv|npy|e57|las|copc\.laz",
+    "matcher": "bev|rootsift|orb|xfeat|superpoint",
+    "prior": "georef",
+}
+"""Values that an option takes, by the end of its name; behind another they are words of the sentence."""
+_CHOICE = "|".join(rf"(?<=-{name} )(?:{words})" for name, words in _WORDS.items())
+_VALUE = rf"EPSG:(?:\.\.\.|\d+)|(?:local|{_CHOICE})(?![\w-])|{_NUMBER}|[XY](?!\w)"
 _OPTION = re.compile(rf"(?<![\w-])--([a-z]+(?:-[a-z]+)*)(?![\w.=-])((?: (?:{_VALUE}))*)")
 
 _in_command: ContextVar[bool] = ContextVar("in_command", default=False)
@@ -59,6 +72,11 @@ def advising(spelling: Spelling, *, command: bool = False) -> Iterator[None]:
 def python_words(function: Callable[P, R]) -> Callable[P, R]:
     """Decorate a function of the Python interface: its errors name keywords, ``source_crs="local"``."""
     return advising(as_keyword)(function)
+
+
+def as_called(text: str) -> str:
+    """Return a text that names options of the command as its reader calls them: by keywords in Python."""
+    return text if _in_command.get() else spelt(text, as_keyword)
 
 
 def spelt(text: str, spelling: Spelling) -> str:

@@ -21,7 +21,7 @@ Row = tuple[str, str]
 _MEANING = {
     "accepted": "The source fits the target; the checks that did not take part in the fit agree.",
     "doubtful": "A transform was found, but the checks leave room for doubt: inspect it before use.",
-    "refused": "The checks speak against the transform, or none was found.",
+    "refused": "The checks do not bear out the pose that was found: do not use it.",
 }
 _LABELS = {
     "held_out_tie_points": "held-out tie points",
@@ -70,9 +70,13 @@ _UNITS = (("_m2", "m²"), ("_m", "m"), ("_deg", "°"), ("_s", "s"), ("_mb", "MB"
 _SHARES = ("_share", "overlap_source", "overlap_target", "_support")
 
 
-def verdict_meaning(verdict: Verdict) -> str:
-    """Return in a sentence what a verdict means for the user."""
-    return _MEANING[verdict.name]
+def verdict_meaning(pair: Pair) -> str:
+    """Return in a sentence what the verdict means for the user; "" before there is one."""
+    if pair.verdict is None:
+        return ""
+    if pair.verdict.name == "refused" and pair.T_target_source is None:
+        return "No pose was found."
+    return _MEANING[pair.verdict.name]
 
 
 def written_text(written: Mapping[str, Any]) -> str:
@@ -200,11 +204,6 @@ def _tie_point_rows(pair: Pair) -> list[Row]:
             "crowns, eaves"
         )
     return [*rows, ("residual of the agreeing ones", text)]
-
-
-def check_rows(verdict: Verdict) -> list[tuple[str, str, str, str]]:
-    """Return the checks as (check, value, wanted, status)."""
-    return [(one.name, one.value, one.wanted, one.status) for one in verdict.checks]
 
 
 def uncertainty_rows(verdict: Verdict) -> list[Row]:
@@ -366,6 +365,11 @@ def markdown_table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     lines += ["| " + " | ".join(cell.replace("|", "/") for cell in row) + " |" for row in rows]
     return "\n".join(lines)
+
+
+def markdown_list(rows: Iterable[tuple[str, str]]) -> str:
+    """Lay out (what, value) as a Markdown list: its lines wrap, where a table is cut off in a narrow view."""
+    return "\n".join(f"- **{what}**: {value}" for what, value in rows)
 
 
 def _metric_row(key: str, value: Any) -> Row:

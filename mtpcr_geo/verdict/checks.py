@@ -51,7 +51,7 @@ def checks_of(
 def warnings_of(evidence: Evidence) -> list[str]:
     """Return a sentence for each check that warns."""
     return [
-        f"look at it: {one.name}: {one.value} (wanted {one.wanted})"
+        f"warning: {one.name}: {one.value} (wanted {one.wanted})"
         for one in _warnings(evidence)
         if one.passed is False
     ]

@@ -79,6 +79,9 @@ def _for_more_evidence(evidence: Evidence) -> str:
     return _OTHER_PLACES
 
 
+_LOOK = "look in the report whether outlines lie on each other"
+
+
 def few_finding(evidence: Evidence) -> CheckFinding | None:
     """Judge whether there are tie points enough to check a result by at all."""
     if evidence.held_out >= FEWEST_HELD_OUT:
@@ -112,13 +115,13 @@ def held_out_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
     if digits < limits.neg_log10_p:
         return CheckFinding(
             f"{agreement(evidence)}, hardly more than chance would give (significance {reached}, wanted "
-            f"{wanted}); look at the result before use"
+            f"{wanted}); {_LOOK}"
         )
     if share < limits.agreeing:
         found, least = percent(share, limits.agreeing)
         return CheckFinding(
             f"{agreement(evidence)}: {found}, wanted {least}; most places that look alike lie elsewhere "
-            "under this result, look at it before use"
+            f"under this result; {_LOOK}"
         )
     return None
 
@@ -163,8 +166,8 @@ def margin_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
 
 
 _AGAINST_RIVALS = (
-    "the site repeats itself, or too little of it is shared: give larger parts of the clouds, or a prior if "
-    "the place is known (option prior)"
+    "the site repeats itself, or too little of it is shared: give larger parts of the clouds, or say "
+    "roughly where the source lies (options near, yaw, prior)"
 )
 
 
@@ -181,7 +184,8 @@ def rival_text(rival: Rival, mapped: bool) -> str:
         if abs(value) >= max(0.05, 0.1 * rival.apart_m)
     ]
     where = ", ".join(parts) or "at the same place"
-    return f"{where}, {abs(rival.turn_deg):.0f} deg turned"
+    turn = f"{abs(rival.turn_deg):.0f}"
+    return f"{where}, {'not turned' if turn == '0' else f'turned by {turn}°'}"
 
 
 def refinement_findings(evidence: Evidence, limits: Limits) -> list[CheckFinding]:
@@ -199,8 +203,8 @@ def refinement_findings(evidence: Evidence, limits: Limits) -> list[CheckFinding
     if evidence.refinement_lost:
         found.append(
             CheckFinding(
-                "the refinement lost the tie points and was not followed; the result is as exact as they "
-                f"are, about {evidence.tolerance_m:g} m"
+                "the refinement lost the tie points and was not followed: the transform is that of the tie "
+                f"points, which agree within {evidence.tolerance_m:g} m"
             )
         )
     final, agreed = evidence.final_agreeing, evidence.held_out_agreeing
@@ -264,7 +268,7 @@ def null_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
     text = f"it fits only {value} times as well as {mirrored} (wanted {wanted})"
     if evidence.null_ratio < 1.0:
         text = f"it fits less well than {mirrored} ({value} times, wanted {wanted})"
-    return CheckFinding(f"{text}; the pose is no surer than chance makes one: look at it before use")
+    return CheckFinding(f"{text}; the pose is no surer than chance makes one; {_LOOK}")
 
 
 def overlap_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:

@@ -15,7 +15,7 @@ from mtpcr_geo.method.refine import SAME_FIT
 from mtpcr_geo.method.scales import tolerance_for
 from mtpcr_geo.verdict.evidence import agreement
 
-_NAMES = {"georef": "the clouds' CRSs put", "file": "--prior puts", "matrix": "--prior puts"}
+_NAMES = {"georef": "the clouds' CRSs put", "file": "the prior given puts", "matrix": "the prior given puts"}
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def departure(pair: Pair) -> tuple[dict[str, Any], tuple[str, ...]]:
         gap = transforms.apply(T, known.middle[None])[0] - known.place
         distance = metrics["prior_distance_m"] = float(np.hypot(gap[0], gap[1]))
         if distance > known.within_m + slack:
-            where = _NAMES.get(known.given_by, "--near puts")
+            where = _NAMES.get(known.given_by, "the place given puts")
             contradictions.append(
                 f"the middle of the source comes to lie {distance:.1f} m from where {where} it, more than "
                 f"the {known.within_m:.3g} m said to be possible"

@@ -49,7 +49,7 @@ def test_a_cloud_without_a_crs_that_lies_where_the_other_does(tmp_path):
     same = write(tmp_path / "same.las", town(2) + PLACE, None)
     found = only(check_clouds(same, target), "same-coordinates")
     assert found.role == "source"
-    assert "--source-crs EPSG:25832" in found.fix
+    assert 'source_crs="EPSG:25832"' in found.fix
     assert only(check_clouds(target, same), "same-coordinates").role == "target"
     assert check_clouds(same, target, source_crs="EPSG:25832").goes_on
     far = write(tmp_path / "far.las", town(2) + PLACE + [5_000.0, 0.0, 0.0], None)
@@ -85,7 +85,7 @@ def test_a_unit_that_is_seen_gives_no_second_error(tmp_path, times):
     report = check_clouds(source, target)
     assert {found.code for found in report.findings if found.severity == "error"} == {"crs-missing"}
     fixes = [found.fix for found in report.findings if found.code == "crs-missing" and found.role == "source"]
-    assert "--source-crs local and --source-unit mm" in fixes[0]
+    assert 'source_crs="local" and source_unit="mm"' in fixes[0]
 
 
 def test_a_cloud_on_its_side_is_not_measured_from_that_side(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any, Literal, get_args, get_origin
 
 import pytest
 from conftest import REPOSITORY
@@ -44,6 +45,27 @@ def _named_in_messages() -> set[str]:
     package = REPOSITORY / "mtpcr_geo"
     files = [path for path in package.rglob("*.py") if path.relative_to(package).parts[0] not in ASIDE]
     return {name for path in files for name in re.findall(r"--[a-z]+(?:-[a-z]+)*", path.read_text("utf-8"))}
+
+
+def choices(annotation: Any) -> list[str]:
+    """The words between which an option is a choice."""
+    if get_origin(annotation) is Literal:
+        return [word for word in get_args(annotation) if isinstance(word, str)]
+    return [word for part in get_args(getattr(annotation, "__value__", annotation)) for word in choices(part)]
+
+
+@pytest.mark.parametrize("model", [RegisterVerb, CheckVerb])
+def test_every_choice_of_an_option_is_its_value(model):
+    found = 0
+    for name, field in shown_fields(model).items():
+        for word in choices(field.annotation):
+            option = spelling(name, field)[0]
+            assert advice.spelt(f"give {option} {word} or so", advice.as_keyword) == (
+                f'give {name}="{word}" or so'
+            )
+            found += 1
+    assert found > 20
+    assert advice.spelt("within --within 5 m of --near", advice.as_keyword) == "within within=5 m of near"
 
 
 @pytest.mark.parametrize(
@@ -100,6 +122,18 @@ def test_each_place_gets_its_own_advice(nowhere, town_files, tmp_path):
     assert "--" not in str(error.value)
     with pytest.raises(CrsError, match='"target_crs": "local" of up'):
         mg.Pipeline(FILE % nowhere).validate()
+
+
+def test_findings_name_options_as_their_reader_does(nowhere, town_files):
+    found = [f"{one.what}; {one.fix}" for one in mg.check(nowhere, town_files[1]).findings]
+    assert any('source_crs="local"' in text for text in found)
+    assert not [text for text in found if re.search(r"(?<![\w-])--[a-z]", text)]
+    done = CliRunner().invoke(app, ["check", nowhere, str(town_files[1])])
+    assert "--source-crs local" in " ".join(done.stdout.split())
+    assert "source_crs" not in done.stdout
+    # the functions that say so to Python were called before: nothing of that stays
+    again = mg.check(nowhere, town_files[1]).findings
+    assert [f"{one.what}; {one.fix}" for one in again] == found
 
 
 def epsg_of(pipeline: mg.Pipeline) -> int | None:

@@ -12,6 +12,7 @@ from helpers_scene import make_pair
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.types import Pair
+from mtpcr_geo.export.recording.bars import LONGEST, Bar, table
 from mtpcr_geo.export.recording.budget import Budget, thin
 from mtpcr_geo.export.recording.focus import overlap_of
 from mtpcr_geo.export.recording.recorder import RerunRecorder
@@ -21,6 +22,7 @@ from mtpcr_geo.method.bev import make_bev
 LOW, HIGH = np.array([15.0, -55.0]), np.array([55.0, -15.0])
 MIDDLE = (LOW + HIGH) / 2.0
 FIELD_OF_VIEW_DEG = 55.0
+FULL, HALF, SLIVER = "\u2588", "\u258c", "\u258f"
 
 
 def corner_pair(n: int = 30_000) -> Pair:
@@ -148,6 +150,8 @@ def test_both_overlaps_are_in_the_picture_of_matches(recording, pair):
         assert np.all(low <= [wide + x, y])
         assert np.all([wide + x, y] <= high)
         assert low[0] <= pair.source.bev.grid.width / 2.0
+        # two overlaps beside each other: as wide as both, as high as one, so that they are seen large
+        assert (high - low)[0] > 1.5 * (high - low)[1]
 
 
 def _corners(parts: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
@@ -170,17 +174,42 @@ def test_without_a_transform_everything_is_shown(tmp_path, verdict):
             assert high.tolist() == [pair.target.bev.grid.width, pair.target.bev.grid.height]
 
 
-def test_bars_carry_their_labels(recording):
+def texts(path: Path) -> dict[str, str]:
+    """The last text of each entity that is one."""
     from rerun.chunk import RrdReader
 
-    labels = {}
-    for chunk in RrdReader(str(recording)).stream().to_chunks():
+    found = {}
+    for chunk in RrdReader(str(path)).stream().to_chunks():
         for row in chunk.to_record_batch().to_pylist():
-            if row.get("LineStrips2D:labels"):
-                labels[chunk.entity_path] = row["LineStrips2D:labels"]
-    assert labels["/hypotheses/scores"][0].startswith("1: +33.0°, 41.2")
-    assert all("cm: " in text for text in labels["/residuals"])
-    assert labels["/time"] == ["assess: 1.50 s"]
+            if row.get("TextDocument:text"):
+                found[chunk.entity_path] = row["TextDocument:text"][0]
+    return found
+
+
+def test_bars_stand_behind_their_texts(recording):
+    found = texts(recording)
+    assert found["/hypotheses"].splitlines()[2].startswith("| 1 | +33.0° | +12.5, -7.2 m |")
+    assert found["/hypotheses"].splitlines()[2].endswith(f"| 41.2 | {LONGEST * FULL} |")
+    for line in found["/residuals"].splitlines()[2:]:
+        assert " cm | " in line
+    assert found["/time"].splitlines()[2:] == [f"| assess | 1.50 | {LONGEST * FULL} |"]
+    assert found["/stage_list"].startswith("1. **assess** (mtpcr.assess), 1.50 s: ")
+
+
+@pytest.mark.parametrize(
+    ("values", "wanted"),
+    [
+        ((2.0, 1.0, 0.0), (14 * FULL, 7 * FULL, "")),
+        ((28.0, 1.0, 3.0), (14 * FULL, HALF, FULL + HALF)),
+        ((100.0, 0.1, -1.0), (14 * FULL, SLIVER, "")),
+        ((np.nan, 0.0), ("", "")),
+        ((np.inf, 3.0), (14 * FULL, 14 * FULL)),
+    ],
+)
+def test_bars_are_as_long_as_their_values(values, wanted):
+    lines = table(("what",), [Bar(("a|b",), value) for value in values]).splitlines()
+    assert lines[:2] == ["| what |  |", "|---|---|"]
+    assert lines[2:] == [f"| a/b | {bar} |" for bar in wanted]
 
 
 def test_a_recording_keeps_to_its_size_however_many_points(tmp_path):

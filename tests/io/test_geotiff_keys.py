@@ -166,5 +166,5 @@ def test_a_unit_is_no_datum(tmp_path):
         files.append(write_raw(path, point_format=1, minor=2, records=[record], encoding=0, count=count))
     report = check_clouds(*files)
     assert report.exit_code == 6
-    assert any("--vertical" in finding.fix for finding in report.findings)
+    assert any('vertical="assume-same"' in finding.fix for finding in report.findings)
     assert check_clouds(*files, vertical="assume-same").exit_code == 0

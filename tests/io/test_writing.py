@@ -272,7 +272,7 @@ def test_check_and_pipelines_take_layout_and_scale(scene, tmp_path, monkeypatch)
     assert report.goes_on
     report = check_clouds(source, target, source_crs="local", source_text=layout, scale=1e-9)
     assert report.exit_code == 7
-    assert any("--scale 1e-07" in one.fix for one in report.findings)
+    assert any("scale=1e-07" in one.fix for one in report.findings)
     # both are shown, where one cannot be opened
     report = check_clouds(source, target, source_crs="local", source_text="x y z")
     assert report.exit_code == 5

@@ -126,9 +126,9 @@ TURNED = Rival(0.1, 0.0, -180.0, 1.25, True)
 @pytest.mark.parametrize(
     ("rivals", "mapped", "text", "withheld"),
     [
-        ((FAR,), True, "another pose, 41 m east, 0 deg turned, fits nearly as well (margin 1.15", True),
-        ((NEAR,), False, "another pose, 1.2 m along +x, 0.4 m along -y, 0 deg turned", False),
-        ((TURNED,), True, "0.1 m east, 180 deg turned", True),
+        ((FAR,), True, "another pose, 41 m east, not turned, fits nearly as well (margin 1.15", True),
+        ((NEAR,), False, "another pose, 1.2 m along +x, 0.4 m along -y, not turned", False),
+        ((TURNED,), True, "0.1 m east, turned by 180°", True),
         ((NEAR, FAR), True, "2 other poses fit nearly as well", True),
         ((), True, "another pose fits nearly as well", False),
         ((replace(FAR, margin=2.0),), True, "another pose fits nearly as well", False),

@@ -24,11 +24,13 @@ class Look:
     Attributes:
         middle: (3,) metres, or (2,) pixels.
         size: its diameter, in the same unit.
+        sides: of the box around it, where it is made of several; else None.
 
     """
 
     middle: Floats
     size: float
+    sides: Floats | None = None
 
     @property
     def box(self) -> Floats:
@@ -162,4 +164,4 @@ def _around(looks: list[Look]) -> Look:
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
     middle = (low + high) / 2.0
     size = max(float(np.max((high - low)[:2])), max(look.size for look in looks))
-    return Look(middle, size)
+    return Look(middle, size, high - low)

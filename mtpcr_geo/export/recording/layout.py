@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from mtpcr_geo.core.arrays import Floats
-from mtpcr_geo.export.recording import bars
 from mtpcr_geo.export.recording.focus import Look
 
 TIMELINE = "stage"
@@ -16,6 +15,8 @@ AWAY = np.array([0.0, -0.75, 0.8])
 """From the middle of the overlap to the eye, in diameters of the overlap."""
 MARGIN = 0.7
 """Half of what a picture shows, in diameters of the overlap."""
+MARGIN_OF_TWO = 0.55
+"""Half of what a picture of two overlaps beside each other shows, in sides of the box around both."""
 _BACKGROUND = (18, 20, 24)
 
 
@@ -27,7 +28,6 @@ class Recorded:
         paths: entities that hold something.
         bounds: (2, 3) lowest and highest coordinates by entity root, metres, for the first view.
         images: (width, height) in pixels by entity root.
-        bars: number of bars by entity.
         looks: the overlap, by entity root; empty where there is none.
 
     """
@@ -35,7 +35,6 @@ class Recorded:
     paths: set[str] = field(default_factory=set)
     bounds: dict[str, Floats] = field(default_factory=dict)
     images: dict[str, tuple[int, int]] = field(default_factory=dict)
-    bars: dict[str, int] = field(default_factory=dict)
     looks: dict[str, Look] = field(default_factory=dict)
 
     def has(self, root: str) -> bool:
@@ -64,8 +63,9 @@ def layout(recorded: Recorded) -> Any:
             rrb.TextDocumentView(origin="run", name="Options and versions"),
         ),
         rrb.Tabs(
-            rrb.TextLogView(origin="stages", name="Stages", columns=_log_columns()),
-            _bars(recorded, "time", "Seconds a stage"),
+            rrb.TextDocumentView(origin="stage_list", name="Stages"),
+            _bars("time", "Seconds"),
+            rrb.TextLogView(origin="stages", name="Log", columns=_log_columns()),
         ),
         row_shares=[2, 1],
     )
@@ -82,7 +82,7 @@ def layout(recorded: Recorded) -> Any:
 def _log_columns() -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["LogLevel", "Body"])
+    return rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["Body"])
 
 
 def _overview(recorded: Recorded) -> Any:
@@ -127,11 +127,9 @@ def _matches(recorded: Recorded) -> Any:
         return None
     if not recorded.has("hypotheses"):
         return rrb.Horizontal(matches, name="Matches")
-    below = rrb.Horizontal(
-        _bars(recorded, "hypotheses/scores", "Candidate poses: yaw and strength"),
-        rrb.TextDocumentView(origin="hypotheses/table", name="Candidate poses"),
+    return rrb.Vertical(
+        matches, _bars("hypotheses", "Candidate poses, by strength"), row_shares=[2, 1], name="Matches"
     )
-    return rrb.Vertical(matches, below, row_shares=[2, 1], name="Matches")
 
 
 def _keypoints(recorded: Recorded) -> Any:
@@ -149,10 +147,10 @@ def _keypoints(recorded: Recorded) -> Any:
             grids.append(rrb.Grid(*views, grid_columns=2, name=title))
     if recorded.has("sweep"):
         charts = [
-            _bars(recorded, f"sweep/{what}", f"{title} by rotation of the source, degrees")
+            _bars(f"sweep/{what}", f"{title} by rotation of the source")
             for what, title in (("agreeing", "Agreeing matches"), ("matches", "Matches"))
         ]
-        grids.append(rrb.Vertical(*charts, name="Sweep"))
+        grids.append(rrb.Horizontal(*charts, name="Sweep"))
     return rrb.Tabs(*grids, name="Keypoints") if grids else None
 
 
@@ -172,8 +170,7 @@ def _ties(recorded: Recorded) -> Any:
     space = _space(
         recorded, "aligned", "Tie points by residual: green fits, red does not", hide=("source", "links")
     )
-    chart = _bars(recorded, "residuals", "Number of tie points by residual")
-    return rrb.Horizontal(space, chart, column_shares=[3, 1], name="Tie points")
+    return rrb.Horizontal(space, _bars("residuals", "Residuals"), column_shares=[2, 1], name="Tie points")
 
 
 def _inputs(recorded: Recorded) -> Any:
@@ -190,7 +187,7 @@ def _inputs(recorded: Recorded) -> Any:
 def _map(recorded: Recorded) -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.MapView(origin="map", name="Map") if recorded.has("map") else None
+    return rrb.MapView(origin="map", name="Map: source orange, target blue") if recorded.has("map") else None
 
 
 def _space(recorded: Recorded, origin: str, name: str, hide: tuple[str, ...] = ()) -> Any:
@@ -234,19 +231,14 @@ def _flat(recorded: Recorded, origin: str, name: str) -> Any:
         if look is None:
             bounds = rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height))
         else:
-            (left, top), (right, bottom) = look.middle - MARGIN * look.size, look.middle + MARGIN * look.size
+            half = MARGIN * look.size if look.sides is None else MARGIN_OF_TWO * look.sides
+            (left, top), (right, bottom) = look.middle - half, look.middle + half
             bounds = rrb.VisualBounds2D(x_range=(left, right), y_range=(top, bottom))
     return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds, background=_BACKGROUND)
 
 
-def _bars(recorded: Recorded, origin: str, name: str) -> Any:
-    """Return a 2D view of labelled bars."""
+def _bars(origin: str, name: str) -> Any:
+    """Return a view of a table of bars."""
     import rerun.blueprint as rrb
 
-    x_range, y_range = bars.bounds(recorded.bars.get(origin, 1))
-    return rrb.Spatial2DView(
-        origin=origin,
-        name=name,
-        visual_bounds=rrb.VisualBounds2D(x_range=x_range, y_range=y_range),
-        background=_BACKGROUND,
-    )
+    return rrb.TextDocumentView(origin=origin, name=name)

@@ -24,14 +24,14 @@ class Pen:
     Attributes:
         log: logs something under an entity path.
         image: logs a picture under an entity path, shrunk to the budget; returns by how much.
-        bars: logs labelled bars under an entity path.
+        bars: logs a table of bars under an entity path, given its head.
         budget: how much may be logged.
 
     """
 
     log: Callable[[str, Any], None]
     image: Callable[[str, drawing.Picture], float]
-    bars: Callable[[str, Sequence[bars.Bar]], None]
+    bars: Callable[[str, Sequence[str], Sequence[bars.Bar]], None]
     budget: Budget
 
 
@@ -77,10 +77,10 @@ def log_sweep(pen: Pen, pair: Pair) -> None:
     for name in ("agreeing", "matches"):
         counts = reported[f"turn_{name}"]
         shown = [
-            bars.Bar(f"{turn:g}°: {count}", float(count), drawing.GOOD_RGB)
+            bars.Bar((f"{turn:g}°", str(count)), float(count))
             for turn, count in zip(turns, counts, strict=True)
         ]
-        pen.bars(f"sweep/{name}", shown)
+        pen.bars(f"sweep/{name}", ("rotation", "matches"), shown)
 
 
 def log_focus(pen: Pen, pair: Pair) -> None:

@@ -27,6 +27,7 @@ APPLICATION = "mtpcr_geo"
 _ROLE_RGB = {"source": drawing.SOURCE_RGB, "target": drawing.TARGET_RGB}
 _SHOWN_S = 0.05
 _SMALLEST_PICTURE, _LARGEST_STEP = 64, 0.9
+_LIT = 70.0
 _KINDS = ("disagreeing", "agreeing", "held_out", "unjudged")
 
 
@@ -92,19 +93,20 @@ class RecordingWriter:
             self._log_pair(value)
         bad = "verdict" in made and "accepted" not in made
         level = rr.TextLogLevel.WARN if bad else rr.TextLogLevel.INFO
-        line = f"{tag} ({stage_type}), {seconds:.2f} s: {made}"
+        line = f"{tag}: {made}"  # short: lines of the log are cut off, not wrapped
         self._log("stages", rr.TextLog(visible(line), level=level))
         self._trail.append(
             {"tag": tag, "type": stage_type, "options": options, "seconds": seconds, "made": made}
         )
         self._log("seconds", rr.Scalars(seconds))
+        self._log("stage_list", self._markdown(self._stage_list()))
         self._log("summary", self._markdown(self._summary()))
         self._stage += 1
 
     def close(self) -> None:
         """Send the layout and finish the file."""
         self._stream.log("run", self._markdown(self._run_text()), static=True)
-        self._log_bars("time", self._time_bars())
+        self._log_bars("time", ("stage", "seconds"), self._time_bars())
         trail = trail_json(self._properties, self._trail, self._pair, self._drawn())
         self._stream.log(ENTITY, rr.TextDocument(trail, media_type="application/json"), static=True)
         if self._pair is not None:
@@ -163,7 +165,9 @@ class RecordingWriter:
     def _log_input(self, side: Side) -> None:
         xyz = self._thin(side.sample, "input", side.role)
         colours = drawing.height_colours(xyz[:, 2], *drawing.height_range(xyz[:, 2]))
-        self._log_points(f"input/{side.role}", xyz, colours, root=f"input/{side.role}")
+        # these are few, and the darkest would not be seen
+        colours = (_LIT + (1.0 - _LIT / 255.0) * colours).astype(np.uint8)
+        self._log_points(f"input/{side.role}", xyz, colours, root=f"input/{side.role}", radius=1.5)
 
     def _log_levelled(self, side: Side) -> None:
         xyz = transforms.apply(side.T_level_work, self._thin(side.sample, "levelled", side.role))
@@ -189,20 +193,12 @@ class RecordingWriter:
         hypotheses = pair.matches.hypotheses
         rows = descriptions.hypothesis_rows(pair)
         shown = [
-            bars.Bar(
-                f"{row[0]}: {row[1]}, {row[3]}",
-                float(one.score if one.strength is None else one.strength),
-                drawing.UNJUDGED_RGB,
-            )
+            bars.Bar((*row[:3], row[4], row[3]), float(one.score if one.strength is None else one.strength))
             for one, row in zip(hypotheses, rows, strict=False)
         ]
-        self._log_bars("hypotheses/scores", shown)
         strong = hypotheses[0].strength is not None
-        head = ("rank", "yaw", "shift", "strength" if strong else "score", "overlap")
-        self._log(
-            "hypotheses/table",
-            self._markdown(descriptions.markdown_table(head, rows)),
-        )
+        head = ("rank", "yaw", "shift", "overlap", "strength" if strong else "score")
+        self._log_bars("hypotheses", head, shown)
 
     def _log_matches(self, pair: Pair) -> None:
         if pair.source.bev is None or pair.target.bev is None:
@@ -270,10 +266,10 @@ class RecordingWriter:
         top = max(float(np.percentile(residual, 95)), 0.05)
         counts, edges = np.histogram(np.clip(residual, 0.0, top), bins=10, range=(0.0, top))
         shown = [
-            bars.Bar(f"{100 * low:.0f}-{100 * high:.0f} cm: {count}", float(count), drawing.GOOD_RGB)
+            bars.Bar((f"{100 * low:.0f} to {100 * high:.0f} cm", str(count)), float(count))
             for low, high, count in zip(edges[:-1], edges[1:], counts, strict=True)
         ]
-        self._log_bars("residuals", shown)
+        self._log_bars("residuals", ("off by", "tie points"), shown)
 
     def _log_map(self, pair: Pair) -> None:
         from pyproj import Transformer
@@ -293,9 +289,9 @@ class RecordingWriter:
             self._log(f"map/{role}", line)
 
     def _log_points(
-        self, path: str, xyz: Floats, colours: NDArray[np.uint8], root: str | None = None
+        self, path: str, xyz: Floats, colours: NDArray[np.uint8], root: str | None = None, radius: float = 0.9
     ) -> None:
-        points = rr.Points3D(xyz.astype(np.float32), colors=colours, radii=rr.Radius.ui_points(0.9))
+        points = rr.Points3D(xyz.astype(np.float32), colors=colours, radii=rr.Radius.ui_points(radius))
         self._log(path, points)
         if root is not None and len(xyz):
             bounds = _bounds(xyz)
@@ -317,14 +313,13 @@ class RecordingWriter:
         self._log(path, rr.EncodedImage(contents=data, media_type="image/jpeg"))
         return float(small.shape[1] / picture.shape[1])
 
-    def _log_bars(self, path: str, shown: Sequence[bars.Bar]) -> None:
+    def _log_bars(self, path: str, head: Sequence[str], shown: Sequence[bars.Bar]) -> None:
         if shown:
-            self._recorded.bars[path] = len(shown)
-            self._log(path, bars.drawn(shown))
+            self._log(path, self._markdown(bars.table(head, shown)))
 
     def _time_bars(self) -> list[bars.Bar]:
         return [
-            bars.Bar(f"{tag}: {seconds:.2f} s", seconds, drawing.TARGET_RGB)
+            bars.Bar((tag, f"{seconds:.2f}"), seconds)
             for tag, _, seconds in self._stages
             if seconds >= _SHOWN_S
         ]
@@ -369,7 +364,7 @@ class RecordingWriter:
         pair = self._pair
         parts = []
         if pair is not None and pair.verdict is not None:
-            head, meaning = pair.verdict.headline, descriptions.verdict_meaning(pair.verdict)
+            head, meaning = pair.verdict.headline, descriptions.verdict_meaning(pair)
             parts.append(f"# {pair.verdict.name.capitalize()}\n\n{head}\n\n{meaning}")
             parts.append("\n".join(f"- {reason}" for reason in pair.verdict.reasons))
         else:
@@ -378,40 +373,39 @@ class RecordingWriter:
             parts.append(self._drawn())
             rows = descriptions.transform_rows(pair)
             if rows:
-                parts.append("## Transform\n\n" + descriptions.markdown_table(("what", "value"), rows))
+                parts.append("## Transform\n\n" + descriptions.markdown_list(rows))
             if pair.verdict is not None and pair.verdict.checks:
-                table = descriptions.markdown_table(
-                    ("check", "value", "wanted", "met"), descriptions.check_rows(pair.verdict)
-                )
-                means = "\n".join(f"- {one.name}: {one.meaning}" for one in pair.verdict.checks)
-                parts.append(f"## Checks\n\n{table}\n\n{means}")
+                checks = [
+                    (f"{one.name}, {one.status}", f"{one.value}; wanted: {one.wanted}. *{one.meaning}*")
+                    for one in pair.verdict.checks
+                ]
+                parts.append("## Checks\n\n" + descriptions.markdown_list(checks))
             if pair.verdict is not None and pair.verdict.metrics:
-                table = descriptions.markdown_table(
-                    ("figure", "value"), descriptions.metric_rows(pair.verdict.metrics)
-                )
-                parts.append("## All figures\n\n" + table)
+                figures = descriptions.metric_rows(pair.verdict.metrics)
+                parts.append("## All figures\n\n" + descriptions.markdown_list(figures))
             for side in [pair.target] if pair.source is pair.target else [pair.source, pair.target]:
                 if self._new(f"rows {side.role}", side):
-                    self._side_texts[side.role] = descriptions.markdown_table(
-                        ("what", "value"), descriptions.side_rows(side)
-                    )
+                    self._side_texts[side.role] = descriptions.markdown_list(descriptions.side_rows(side))
                 parts.append(f"## {side.role.capitalize()}\n\n{self._side_texts[side.role]}")
-        rows = [(tag, f"{seconds:.2f} s") for tag, _, seconds in self._stages]
-        parts.append("## Time\n\n" + descriptions.markdown_table(("stage", "time"), rows))
         return "\n\n".join(parts)
+
+    def _stage_list(self) -> str:
+        """List the stages so far: what each made, in lines that wrap."""
+        return "\n".join(
+            f"{number}. **{one['tag']}** ({one['type']}), {one['seconds']:.2f} s: {one['made']}"
+            for number, one in enumerate(self._trail, start=1)
+        )
 
     def _run_text(self) -> str:
         parts = []
         if self._options:
             rows = [(tag, descriptions.plain(options)) for tag, options in self._options.items()]
-            parts.append("## Options\n\n" + descriptions.markdown_table(("stage", "options"), rows))
+            parts.append("## Options\n\n" + descriptions.markdown_list(rows))
         for name in ("inputs", "versions"):
             value = self._properties.get(name)
             if isinstance(value, Mapping):
                 rows = [(str(key), descriptions.plain(one)) for key, one in value.items()]
-                parts.append(
-                    f"## {name.capitalize()}\n\n" + descriptions.markdown_table(("what", "value"), rows)
-                )
+                parts.append(f"## {name.capitalize()}\n\n" + descriptions.markdown_list(rows))
             elif isinstance(value, list):
                 parts.append(
                     f"## {name.capitalize()}\n\n" + "\n".join(f"- {descriptions.plain(v)}" for v in value)

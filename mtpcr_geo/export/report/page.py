@@ -61,7 +61,7 @@ def _content(pair: Pair, done: Sequence[Mapping[str, Any]], facts: Mapping[str, 
         "names": f"{Path(pair.source.cloud.name).name} to {Path(pair.target.cloud.name).name}",
         "version": __version__,
         "date": now.date().isoformat(),
-        "verdict": _verdict(pair.verdict),
+        "verdict": _verdict(pair),
         "written": descriptions.written_text(written) if written is not None else "",
         "accuracy": told.accuracy(pair.verdict),
         "accuracy_title": _accuracy_title(pair.verdict),
@@ -120,7 +120,8 @@ def _pictures(pair: Pair) -> dict[str, Any]:
         return found | {name: future.result() for name, future in drawn.items()}
 
 
-def _verdict(verdict: Verdict | None) -> dict[str, Any] | None:
+def _verdict(pair: Pair) -> dict[str, Any] | None:
+    verdict = pair.verdict
     if verdict is None:
         return None
     head, _, rest = verdict.headline.partition(":")
@@ -128,7 +129,7 @@ def _verdict(verdict: Verdict | None) -> dict[str, Any] | None:
         "name": verdict.name,
         "head": head,
         "rest": rest,
-        "meaning": descriptions.verdict_meaning(verdict),
+        "meaning": descriptions.verdict_meaning(pair),
         "reasons": verdict.reasons,
     }
 
