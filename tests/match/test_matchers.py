@@ -329,7 +329,7 @@ def test_focus_matches_again_where_overlap_is_small():
         logged.append(path)
         return 1.0
 
-    pen = Pen(lambda path, what: logged.append(path), note, lambda path, shown: None, Budget())
+    pen = Pen(lambda path, what: logged.append(path), note, lambda path, head, shown: None, Budget())
     log_focus(pen, pair.with_(matches=forced))
     assert logged == ["focus/before/image", "focus/before/lines", "focus/after/image", "focus/after/lines"]
     # still on the pixels of the rasters given

@@ -137,8 +137,7 @@ def test_every_place_says_the_same(name: str, force: bool, tmp_path: Path) -> No
     assert [one["check"] for one in run["checks"]] == [one.name for one in verdict.checks]
     for one in run["checks"]:
         assert all(text in page for text in (one["value"], one["wanted"], one["meaning"]))
-        row = f"| {one['check']} | {one['value']} | {one['wanted']} | {one['status']} |"
-        assert row in recording
+        assert f"- **{one['check']}, {one['status']}**: {one['value']}; wanted: {one['wanted']}." in recording
     refusing = [one for one in run["checks"] if one["status"] == "not passed"]
     assert bool(refusing) == (name != "accepted")
 
@@ -179,7 +178,7 @@ def test_every_place_says_the_same(name: str, force: bool, tmp_path: Path) -> No
 
     # the figures of the metrics, wherever they are printed
     for label, value in descriptions.metric_rows(verdict.metrics):
-        assert f"| {label} | {value} |" in recording
+        assert f"- **{label}**: {value}" in recording
         assert f"{label}{value}" in page
     for line in terminal.splitlines():
         for label, value in descriptions.metric_rows(verdict.metrics):

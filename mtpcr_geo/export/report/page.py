@@ -7,7 +7,7 @@ import datetime
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -100,22 +100,21 @@ def _pictures(pair: Pair) -> dict[str, Any]:
         "matched": figures.matched,
         "error_map": figures.error_map,
     }
-    of_overlay: dict[str, Callable[[Overlay], Any]] = {}
-    overlay = None
+    of_overlay: dict[str, Callable[[], Any]] = {}
     if both and pair.T_target_source is not None:
         of_pair = {"swipe": figures.swipe, **of_pair}
         overlay = Overlay(pair)
         if overlay.shared.any():
             of_overlay = {
-                "zoom": figures.overlap_zoom,
-                "difference": figures.difference,
-                "sections": figures.cross_sections,
-                "patches": figures.patches,
+                "zoom": partial(figures.overlap_zoom, overlay),
+                "difference": partial(figures.difference, overlay),
+                "sections": partial(figures.cross_sections, overlay),
+                "patches": partial(figures.patches, overlay),
             }
     else:
         of_pair["reliefs"] = figures.reliefs
     with ThreadPoolExecutor(usable_cores()) as threads, opencv_in_one_thread():
-        drawn = {name: threads.submit(draw, overlay) for name, draw in of_overlay.items()}
+        drawn = {name: threads.submit(draw) for name, draw in of_overlay.items()}
         drawn |= {name: threads.submit(draw, pair) for name, draw in of_pair.items()}
         return found | {name: future.result() for name, future in drawn.items()}
 
