@@ -40,6 +40,7 @@ FOUND = {
     "bounds whose norm overflows": ("files", 30040),
     "points of which the check leaves out all": ("files", 40204),
     "points that a transform moves to infinity": ("files", 459),
+    "a floor of cells without number": ("files", 2_001_061),
 }
 
 
