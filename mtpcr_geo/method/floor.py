@@ -29,7 +29,7 @@ APART_DEG = 10.0
 """Floors that are no farther apart are one."""
 STILL_DEG = 0.02
 MOST_CELLS = 10_000_000
-"""Cells of a grid above which only those that hold points are numbered: two sites far apart span any number."""
+"""Cells of a grid above which only those with points are numbered: two sites far apart span any number."""
 LEAST_UNEVEN = 1e-3
 """Spread over extent below which floors count as equally even."""
 
@@ -123,7 +123,7 @@ def _lowest(xyz: Floats, cell: float) -> Floats:
 
 
 def _cell_numbers(cells: Floats) -> NDArray[np.int64]:
-    """Number cells (n, 2), of columns and rows from 0 on, in their order; no number is far above n."""
+    """Return a number for each cell (n, 2), in the order of columns and rows, without room for empty ones."""
     across = cells.max(axis=0, initial=0.0) + 1.0
     if across.prod() <= MOST_CELLS:
         column, row = cells.astype(np.int64).T
