@@ -129,7 +129,8 @@ def _cell_numbers(cells: Floats) -> NDArray[np.int64]:
         column, row = cells.astype(np.int64).T
         return np.asarray(column * int(across[1]) + row)
     column, row = (np.unique(one, return_inverse=True)[1].astype(np.int64) for one in cells.T)
-    return np.unique(column * (int(row.max(initial=0)) + 1) + row, return_inverse=True)[1].astype(np.int64)
+    numbers = np.unique(column * (int(row.max(initial=0)) + 1) + row, return_inverse=True)[1]
+    return np.asarray(numbers, np.int64)
 
 
 def _plane(lowest: Floats, extent: float) -> tuple[Floats, float, Floats]:

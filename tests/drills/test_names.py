@@ -42,7 +42,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     "words",
     [["check", "@pipe"], ["apply", "pipe", "a.las", "o.las"], ["pipeline", "pipe"], ["check", "pipe"],
-     ["verify", "run"], ["survey", "build", "a.las", "-o", "survey"], ["batch", "jobs.csv", "-o", "out"]],
+     ["verify", "run"], ["survey", "build", "a.las", "-o", "survey"],
+     ["batch", "jobs.csv", "-o", "o", "--target", "a.las"]],
     ids=lambda words: words[0],
 )  # fmt: skip
 def test_a_named_pipe_where_a_text_is_expected_is_an_error_and_no_endless_wait(words, place):
