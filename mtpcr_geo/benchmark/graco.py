@@ -34,6 +34,7 @@ TRUTH_TOPIC = "/gnss/ground_truth"
 LARGEST_GAP_S = 0.25
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _PLACES = {"A": "aerial", "G": "ground"}
+_FARTHEST_M = 1e8
 _THIN_AT = 4_000_000
 _DAMAGES = (
     ArithmeticError,
@@ -193,6 +194,8 @@ def read_sequence(
             distance = np.linalg.norm(xyz, axis=1)
             keep = (distance >= range_m[0]) & (distance <= range_m[1]) & path.covers(time)
             parts.append(place(xyz[keep], time[keep], path, T_imu_lidar))
+            if not (np.abs(parts[-1]) < _FARTHEST_M).all():
+                raise InputError(f"{bag} is damaged: {truth_topic} holds poses that are no places on earth")
             held += len(parts[-1])
             if voxel_m > 0 and held > limit:
                 parts = [_thinned(np.concatenate(parts), voxel_m)]
@@ -201,8 +204,6 @@ def read_sequence(
     if not held:
         raise InputError(f"{bag} holds no points on {points_topic} at times that {truth_topic} covers")
     cloud = np.concatenate(parts)
-    if not np.isfinite(cloud).all():
-        raise InputError(f"{bag} is damaged: {truth_topic} holds poses that are not finite")
     return _thinned(cloud, voxel_m) if voxel_m > 0 else cloud
 
 

@@ -96,11 +96,14 @@ def by_area(source: Inspection, target: Inspection) -> Relation:
     from mtpcr_geo.core.frames import box_points
     from mtpcr_geo.crs.operation import area_of
 
+    for cloud in (source, target):
+        if cloud.claim.facts is None:
+            return Relation("unknown", why=f"the CRS of the {cloud.role} is not known")
     middles = []
     for cloud in (source, target):
         facts = cloud.claim.facts
-        if facts is None:
-            return Relation("unknown", why=f"the CRS of the {cloud.role} is not known")
+        if facts is None or cloud.is_local:
+            return Relation("unknown", why=f"the {cloud.role} has local coordinates")
         area = area_of(facts, box_points(cloud.bounds, 2)) if np.isfinite(cloud.bounds).all() else None
         if area is None:
             return Relation("unknown", why=f"the coordinates of the {cloud.role} are no place in its CRS")

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from mtpcr_geo.check.pair import Relation, distance_text
-from mtpcr_geo.core.wording import visible
+from mtpcr_geo.core.wording import in_a_line
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -61,16 +61,16 @@ def print_report(console: Console, report: CheckReport) -> None:
             for role, file in report.files.items()
         ]
         for label in _cells(next(iter(report.clouds.values()))):
-            table.add_row(label, *(Text(visible(column[label])) for column in columns))
+            table.add_row(label, *(Text(in_a_line(column[label])) for column in columns))
         console.print(table)
     if report.relation is not None:
-        console.print(Text(visible(f"  {relation_text(report.relation)}")), soft_wrap=True)
+        console.print(Text(in_a_line(f"  {relation_text(report.relation)}")), soft_wrap=True)
     for finding in report.findings:
         where = "" if finding.role == "both" or not several else f"{finding.role}: "
         line = Text(f"{finding.severity:>7} ", _COLOUR[finding.severity])
-        console.print(line.append(visible(f"{where}{finding.what}"), "default"), soft_wrap=True)
+        console.print(line.append(in_a_line(f"{where}{finding.what}"), "default"), soft_wrap=True)
         if finding.fix:
-            console.print(Text(visible(f"        -> {finding.fix}"), "dim"), soft_wrap=True)
+            console.print(Text(in_a_line(f"        -> {finding.fix}"), "dim"), soft_wrap=True)
     if report.goes_on:
         console.print(Text("register would go on with this", "bold green"))
     else:

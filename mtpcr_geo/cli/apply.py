@@ -5,6 +5,7 @@ from __future__ import annotations
 from mtpcr_geo.cli.options import ApplyVerb
 from mtpcr_geo.cli.parameters import command_of
 from mtpcr_geo.cli.shared import progress_bars, say, warn
+from mtpcr_geo.core.wording import in_a_line
 
 
 def run(options: ApplyVerb) -> None:
@@ -35,7 +36,7 @@ def run(options: ApplyVerb) -> None:
     if doubts is not None:
         warn(doubts)
     if not options.quiet:
-        say(f"wrote {written}")
+        say(f"wrote {in_a_line(written)}")
 
 
 command = command_of(ApplyVerb, run)

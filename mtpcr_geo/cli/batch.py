@@ -12,6 +12,7 @@ from mtpcr_geo.cli.options import Quiet
 from mtpcr_geo.cli.parameters import command_of
 from mtpcr_geo.cli.shared import progress_bars, say, warn
 from mtpcr_geo.core.errors import InputError
+from mtpcr_geo.core.wording import in_a_line
 from mtpcr_geo.pipeline.options import RegisterOptions
 from mtpcr_geo.pipeline.shown import INPUTS, OUTPUT, Shown
 from mtpcr_geo.survey.options import BatchOptions
@@ -76,7 +77,7 @@ def run(options: BatchVerb) -> None:
         counts = Counter(row.verdict for row in batch.rows)
         names = ("accepted", "doubtful", "refused", "failed")
         say(f"{batch.run} of {len(batch.rows)} jobs run now: " + ", ".join(f"{counts[n]} {n}" for n in names))
-        say(f"  {batch.table}\n  {batch.map}")
+        say(f"  {in_a_line(batch.table)}\n  {in_a_line(batch.map)}")
     for row in failed[:MOST_NAMED]:
         warn(f"{row.name}: {row.reason}")
     if failed:

@@ -14,6 +14,7 @@ from pydantic.fields import FieldInfo
 from mtpcr_geo.cli.options import ApplyVerb, CheckVerb, QgisPluginVerb, RegisterVerb
 from mtpcr_geo.cli.parameters import command_of, help_of, shown_fields, spelling
 from mtpcr_geo.cli.shared import say
+from mtpcr_geo.core.wording import in_a_line
 from mtpcr_geo.pipeline.shown import INPUTS, OUTPUT, Shown
 
 # what a dialog has no use for: it prints nothing, and empty fields say nothing
@@ -37,7 +38,7 @@ def run(options: QgisPluginVerb) -> None:
         write_plugin(outputs.path(options.out), verbs(), _own_command())
         outputs.commit()
     if not options.quiet:
-        say(f"wrote {options.out}")
+        say(f"wrote {in_a_line(options.out)}")
 
 
 def verbs() -> dict[str, Any]:

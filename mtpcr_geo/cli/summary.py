@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.wording import visible
+from mtpcr_geo.core.wording import in_a_line
 from mtpcr_geo.verdict.findings import chance_text
 
 if TYPE_CHECKING:
@@ -73,18 +73,18 @@ def print_registration(
     head, _, rest = result.verdict.headline.partition(":")
     console.print(Text.assemble((f"{head}:", _COLOUR[name]), rest), soft_wrap=True)
     for reason in _unsaid(result.verdict):
-        console.print(Text(visible(f"  {reason}")), soft_wrap=True)
+        console.print(Text(in_a_line(f"  {reason}")), soft_wrap=True)
     facts = Table(box=None, show_header=False, pad_edge=True, padding=(0, 1))
     for label, value in (*_transform_rows(result), *_metric_rows(result.verdict, verbose)):
-        facts.add_row(Text(visible(label)), Text(visible(value)))
+        facts.add_row(Text(in_a_line(label)), Text(in_a_line(value)))
     if facts.row_count:
         console.print(facts)
     if verbose:
         _print_stages(result.report)
     for one in _to_open(result) if files else ():
-        console.print(Text(visible(f"  {one.name}")), Text(one.what, "dim"), soft_wrap=True)
+        console.print(Text(in_a_line(f"  {one.name}")), Text(one.what, "dim"), soft_wrap=True)
     for line in (*_withheld_lines(result, force_with), *_left_out_lines(result)):
-        console.print(Text(visible(f"  {line}"), "dim"), soft_wrap=True)
+        console.print(Text(in_a_line(f"  {line}"), "dim"), soft_wrap=True)
 
 
 def print_run(result: RunResult, *, verbose: bool = False, console: Console | None = None) -> None:
@@ -102,7 +102,7 @@ def print_run(result: RunResult, *, verbose: bool = False, console: Console | No
         _print_stages(result.done)
     for path in result.outputs:
         if path not in named:
-            console.print(visible(f"  wrote {path}"), soft_wrap=True, markup=False)
+            console.print(in_a_line(f"  wrote {path}"), soft_wrap=True, markup=False)
 
 
 def _withheld_lines(result: Registration, force_with: str) -> list[str]:
@@ -214,4 +214,4 @@ def _print_stages(done: Sequence[StageRecord]) -> None:
             "" if memory is None else f"  {memory:7.0f} MiB"
         )
         text = f"  {record.seconds:8.2f} s{more}  {record.tag} ({record.type}) {note}".rstrip()
-        talk.print(visible(text), soft_wrap=True, markup=False)
+        talk.print(in_a_line(text), soft_wrap=True, markup=False)

@@ -11,6 +11,7 @@ from mtpcr_geo.cli.options import Quiet
 from mtpcr_geo.cli.parameters import command_of
 from mtpcr_geo.cli.shared import progress_bars, say, warn
 from mtpcr_geo.core.errors import InputError, OptionError
+from mtpcr_geo.core.wording import in_a_line
 from mtpcr_geo.pipeline.shown import INPUTS, Shown
 from mtpcr_geo.survey.options import BuildOptions, Folder
 
@@ -58,7 +59,7 @@ def run(options: SurveyVerb) -> None:
     if not options.quiet:
         points = sum(tile.used for tile in survey.tiles)
         say(
-            f"{survey.folder}: {len(survey.tiles)} tiles, {points:,} points, cells of "
+            f"{in_a_line(survey.folder)}: {len(survey.tiles)} tiles, {points:,} points, cells of "
             f"{survey.frame.cell_m:g} m in {survey.frame.crs.name}; {built.read} tiles read and "
             f"{built.merged} blocks written now"
         )

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from mtpcr_geo.core.errors import InputError
 
 LARGEST_TEXT = 2**28
 """Bytes of the largest description, transform or pipeline that is read whole."""
+_OPEN_FILES = ("/dev/fd/", "/proc/")
 
 
 def real(path: str | os.PathLike[str]) -> Path:
@@ -32,6 +34,11 @@ def fault_of(path: str | os.PathLike[str]) -> str:
     return ""
 
 
+def link_among(paths: Iterable[Path]) -> Path | None:
+    """Return the first of some folders that is a link: what is written or removed there lies elsewhere."""
+    return next((path for path in paths if path.is_symlink()), None)
+
+
 def short(path: str | os.PathLike[str]) -> str:
     """Return a path for a message, its middle left out where it is very long."""
     text = os.fspath(path)
@@ -41,11 +48,17 @@ def short(path: str | os.PathLike[str]) -> str:
 def read_whole(path: str | os.PathLike[str]) -> bytes:
     """Return what stands in a small file.
 
+    What a shell puts in the place of a command's output is read to its end; a pipe with a name of its own,
+    which may lie in any folder and never end, is refused.
+
     Raises:
         InputError: if it is larger than any description is, or has no end.
         OSError: if it cannot be read.
 
     """
+    place = real(path)
+    if not str(place).startswith(_OPEN_FILES) and place.is_fifo():
+        raise InputError(f"{short(path)} is a named pipe, which may have no end; save it as a file")
     with Path(path).open("rb") as file:
         found = file.read(LARGEST_TEXT + 1)
     if len(found) > LARGEST_TEXT:

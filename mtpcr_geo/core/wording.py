@@ -59,3 +59,11 @@ def visible(text: str) -> str:
 
 def _escaped(line: str) -> str:
     return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in line)
+
+
+def in_a_line(text: object) -> str:
+    """Return a text as `visible` does, with line ends written as escapes too.
+
+    A name of a file may hold them, and what is printed a line a fact would then hold lines of a stranger's.
+    """
+    return visible(str(text)).replace("\n", r"\n")

@@ -234,6 +234,11 @@ def _heights_agree(facts: CrsFacts, other: CrsFacts, vertical: Vertical, notes: 
 
     """
     if same_heights(facts, other):
+        if facts.height == "unsaid" and facts is not other and vertical == "refuse":
+            notes.append(
+                "neither cloud states what its heights are above: taken as above the same surface; "
+                "a shift between them is solved with the rest"
+            )
         return facts.height != "ellipsoidal" or same_datum(facts, other)
     if vertical != "refuse":
         how = "taken as equal" if vertical == "assume-same" else "their offset is left to the registration"

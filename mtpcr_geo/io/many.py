@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import json
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -135,9 +136,10 @@ def files_of(path: str | Path, is_cloud: Callable[[Path], bool]) -> list[Path]:
         files = _clouds_of([one for one in files if is_cloud(one)] or files)
     if not files:
         raise InputError(f"{path} names no cloud; check the path, or the endings of the files")
-    missing = next((one for one in files if not one.is_file()), None)
+    # whatever the name: os.path.isfile raises nothing
+    missing = next((one for one in files if not os.path.isfile(one)), None)
     if missing is not None:
-        raise InputError(f"{path} names {missing}, which is not there; check the list")
+        raise InputError(f"{path} names {short(missing)}, which is not there; check the list")
     return files
 
 
@@ -222,8 +224,10 @@ def _data_of(assets: dict[str, Any]) -> dict[str, Any]:
     return dict(next(by_role, next(iter(assets.values()))))
 
 
-def _local(place: str) -> str:
+def _local(place: Any) -> str:
     """Return a path of this machine for a ``file://`` address of it; all else as it is."""
+    if not isinstance(place, str):
+        raise TypeError(f"{place!r:.40} is no address of a file")
     parts = urlsplit(place)
     if parts.scheme == "file" and parts.netloc in ("", "localhost"):
         return url2pathname(parts.path)

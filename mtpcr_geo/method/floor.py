@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.transforms import angle_deg, centroid, rotation_to_up
@@ -27,6 +28,8 @@ VOXELS_ACROSS, POINTS = 150.0, 20_000
 APART_DEG = 10.0
 """Floors that are no farther apart are one."""
 STILL_DEG = 0.02
+MOST_CELLS = 10_000_000
+"""Cells of a grid above which only those with points are numbered: two sites far apart span any number."""
 LEAST_UNEVEN = 1e-3
 """Spread over extent below which floors count as equally even."""
 
@@ -109,8 +112,7 @@ def _lowest(xyz: Floats, cell: float) -> Floats:
     low, high = np.percentile(xyz[:, :2], [0.5, 99.5], axis=0)
     inside = ((xyz[:, :2] >= low) & (xyz[:, :2] <= high)).all(axis=1)
     xyz = xyz[inside]
-    column, row = np.floor((xyz[:, :2] - low) / cell).astype(np.int64).T
-    key = column * (int(row.max(initial=0)) + 1) + row
+    key = _cell_numbers(np.floor((xyz[:, :2] - low) / cell))
     z = np.ascontiguousarray(xyz[:, 2])
     # hardly any points may all be left out
     lowest = np.full(int(key.max(initial=-1)) + 1, np.inf)
@@ -118,6 +120,17 @@ def _lowest(xyz: Floats, cell: float) -> Floats:
     low_ones = np.flatnonzero(z == lowest[key])
     _, first = np.unique(key[low_ones], return_index=True)
     return np.asarray(xyz[low_ones[first]])
+
+
+def _cell_numbers(cells: Floats) -> NDArray[np.int64]:
+    """Return a number for each cell (n, 2), in the order of columns and rows, without room for empty ones."""
+    across = cells.max(axis=0, initial=0.0) + 1.0
+    if across.prod() <= MOST_CELLS:
+        column, row = cells.astype(np.int64).T
+        return np.asarray(column * int(across[1]) + row)
+    column, row = (np.unique(one, return_inverse=True)[1].astype(np.int64) for one in cells.T)
+    numbers = np.unique(column * (int(row.max(initial=0)) + 1) + row, return_inverse=True)[1]
+    return np.asarray(numbers, np.int64)
 
 
 def _plane(lowest: Floats, extent: float) -> tuple[Floats, float, Floats]:

@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.errors import MtpcrError, OutputError, RegistrationError
-from mtpcr_geo.core.paths import read_whole
+from mtpcr_geo.core.errors import InputError, MtpcrError, OutputError, RegistrationError
+from mtpcr_geo.core.paths import link_among, read_whole
 from mtpcr_geo.core.progress import NoProgress, Progress
+from mtpcr_geo.core.wording import in_a_line
 from mtpcr_geo.registration import Registration, register
 from mtpcr_geo.survey import is_survey
 from mtpcr_geo.survey.engine import engine_of
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 
 TABLE, MAP, MARK = "batch.csv", "batch.gpkg", "batch.json"
 _ROWS, _JOBS = "rows", "jobs"
+_FORMULAS = ("=", "+", "-", "@")
 DEFAULTS = BatchOptions()
 
 
@@ -134,6 +136,9 @@ def run_batch(
     foreign = os.path.exists(folder) and not os.path.isfile(folder / MARK)
     if foreign and not options.overwrite and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder} is there already, and is no batch; name another folder, or --overwrite")
+    link = link_among([folder / _ROWS, folder / _JOBS, *(folder / _JOBS / job.name for job in jobs)])
+    if link is not None:
+        raise OutputError(f"{link} is a link, and a batch keeps its files in its own folder; remove it")
     write_atomic(folder / MARK, json.dumps({"format": "mtpcr-geo batch", "version": 1}))
     rows = {job.name: _row_of(folder, job) for job in jobs}
     left = [_Task(job, folder) for job in jobs if _is_left(rows[job.name], job, options)]
@@ -234,12 +239,26 @@ def _write_row(folder: Path, row: Row) -> None:
 
 def _row_of(folder: Path, job: Job) -> Row | None:
     """Return the row of a job; None where there is none that can be read."""
+    from pydantic import TypeAdapter, ValidationError
+
     try:
-        data = json.loads(read_whole(_row_path(folder, job.name)))
-        lists = {key: tuple(value) for key, value in data.items() if isinstance(value, list)}
-        return Row(**{**data, **lists})
-    except (OSError, ValueError, TypeError):
+        row = TypeAdapter(Row).validate_json(read_whole(_row_path(folder, job.name)))
+    except (OSError, ValidationError, InputError):
         return None
+    return row if row.name == job.name and _is_placed(row) else None
+
+
+def _is_placed(row: Row) -> bool:
+    """Return whether the outline of a row is one, and its CRS can be read."""
+    from pyproj import CRS
+    from pyproj.exceptions import ProjError
+
+    if len(row.footprint) % 2 or not np.isfinite(row.footprint).all():
+        return False
+    try:
+        return not row.crs or bool(CRS.from_wkt(row.crs).name)
+    except (ProjError, UnicodeError):
+        return False
 
 
 def write_table(path: Path, rows: Sequence[Row]) -> Path:
@@ -252,7 +271,12 @@ def write_table(path: Path, rows: Sequence[Row]) -> Path:
         values: list[Any] = []
         for name in names:
             value = getattr(row, name)
-            values.append(" ".join(f"{v:.17g}" for v in value) if isinstance(value, tuple) else value)
+            if isinstance(value, tuple):
+                value = " ".join(f"{v:.17g}" for v in value)
+            elif name in ("source", "target") and value.startswith(_FORMULAS):
+                # it is the same path, and no spreadsheet takes it for a formula
+                value = f"./{value}"
+            values.append(in_a_line(value) if isinstance(value, str) else value)
         writer.writerow(values)
     write_atomic(path, text.getvalue())
     return path

@@ -18,6 +18,7 @@ import numpy as np
 
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import CrsError, InputError, MtpcrError, OptionError, OutputError
+from mtpcr_geo.core.paths import link_among, short
 from mtpcr_geo.core.progress import NoProgress, Progress
 from mtpcr_geo.core.types import Bev
 from mtpcr_geo.crs.facts import facts_of, same_place
@@ -36,7 +37,7 @@ from mtpcr_geo.survey.index import (
     write_atomic,
     write_frame,
 )
-from mtpcr_geo.survey.mosaic import BLOCK_CELLS, BlockRasteriser, Frame, Mosaic, Place, merge
+from mtpcr_geo.survey.mosaic import BLOCK_CELLS, BLOCKS, BlockRasteriser, Frame, Mosaic, Place, merge
 from mtpcr_geo.survey.options import BuildOptions
 from mtpcr_geo.survey.vrt import write_virtual
 
@@ -118,6 +119,7 @@ def build_survey(
     named = list({tile.path: tile for tile in named}.values())
     if not named:
         raise InputError("no tile is named; give files, a folder or a pattern")
+    _refuse_links(folder)
     frame = _frame(folder, named, options)
     kept = _earlier(folder, frame)
     if not options.prune:
@@ -153,6 +155,20 @@ def build_survey(
     survey.write_index()
     _remove_parts(survey)
     return Built(survey, len(wanted) - len(failed), len(stale), failed)
+
+
+def _refuse_links(folder: Path) -> None:
+    """Refuse a survey whose inner folders lead elsewhere: what is stale there is removed.
+
+    Raises:
+        OutputError: naming the link.
+
+    """
+    link = link_among([folder / _PARTS, folder / BLOCKS, *sorted((folder / BLOCKS).glob("x*"))])
+    if link is not None:
+        raise OutputError(
+            f"{short(link)} is a link, and a survey keeps its files in its own folder; remove it"
+        )
 
 
 def _frame(folder: Path, tiles: Sequence[Tile], options: BuildOptions) -> Frame:
@@ -340,7 +356,7 @@ def _tile_in(path: Path) -> Tile | None:
 def _remove_parts(survey: Survey) -> None:
     """Remove what is kept of tiles that are no longer part of the survey, and what killed builds left."""
     known = {_part_of(survey.folder, tile).name for tile in survey.tiles}
-    for folder, pattern in ((survey.folder / _PARTS, "*"), (survey.folder / "bev", "x*/.*")):
+    for folder, pattern in ((survey.folder / _PARTS, "*"), (survey.folder / BLOCKS, "x*/.*")):
         for path in folder.glob(pattern):
             if path.name not in known:
                 path.unlink(missing_ok=True)

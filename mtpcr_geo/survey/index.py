@@ -14,7 +14,7 @@ import numpy as np
 
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import InputError, OutputError
-from mtpcr_geo.core.paths import read_whole, real
+from mtpcr_geo.core.paths import read_whole, real, short
 from mtpcr_geo.survey import SURVEY
 from mtpcr_geo.survey.mosaic import FACTORS, Frame, Mosaic, Place
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 INDEX = "index.vpc"
 _FORMAT, _VERSION = "mtpcr-geo survey", 1
+_LONGEST_M = 1e6
 _OWN = "mtpcr:"
 
 
@@ -125,7 +126,7 @@ class Survey:
             raise InputError(
                 f"the survey {folder} was not built to its end: it has no {INDEX}; run survey build again"
             ) from error
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             raise InputError(
                 f"the index of the survey {folder} is damaged ({type(error).__name__}: {error}); remove "
                 f"{INDEX}, and run survey build with all tiles"
@@ -182,17 +183,26 @@ def read_frame(folder: Path) -> Frame:
         InputError: if there is none, or it is damaged.
 
     """
+    from pyproj.exceptions import ProjError
+
     try:
         data = json.loads(read_whole(folder / SURVEY))
         if data["format"] != _FORMAT or data["version"] != _VERSION:
             raise ValueError(f"it is of format {data['format']} {data['version']}")
-        return Frame(
-            str(data["crs_wkt"]), float(data["cell_m"]), float(data["unit_m"]), float(data["height_unit_m"])
-        )
+        lengths = [float(data[name]) for name in ("cell_m", "unit_m", "height_unit_m")]
+        if not all(0 < length < _LONGEST_M for length in lengths):
+            raise ValueError(f"its cell and units are {lengths} m")
+        frame = Frame(str(data["crs_wkt"]), *lengths)
+        if not frame.crs.is_projected:
+            raise ValueError(f"{frame.crs.name} is no projected CRS")
+        return frame
     except FileNotFoundError as error:
         raise InputError(f"{folder} is no survey: it has no {SURVEY}; make one by survey build") from error
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{folder / SURVEY} cannot be used ({error}); build the survey anew") from error
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError, ProjError) as error:
+        why = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(
+            f"{folder / SURVEY} cannot be used ({short(why)}); build the survey anew in another folder"
+        ) from error
 
 
 def write_frame(folder: Path, frame: Frame) -> None:

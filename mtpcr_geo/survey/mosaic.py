@@ -33,7 +33,7 @@ BLOCK_CELLS = 512
 FACTORS = (1, 2, 4, 8, 16, 32)
 """Cells of the levels of the pyramid, as multiples of the finest."""
 BANDS = ("top", "low", "count")
-_BEV = "bev"
+BLOCKS = "bev"
 _SOURCES = "MTPCR_SOURCES"
 _TIFF_BLOCK = 256
 
@@ -157,12 +157,12 @@ class Mosaic:
     def path_of(self, place: Place) -> Path:
         """Return the file of a block."""
         column, row = place
-        return self.folder / _BEV / f"x{column}" / f"y{row}.tif"
+        return self.folder / BLOCKS / f"x{column}" / f"y{row}.tif"
 
     def places(self) -> list[Place]:
         """Return the blocks that there are, in order."""
         found = []
-        for path in (self.folder / _BEV).glob("x*/y*.tif"):
+        for path in (self.folder / BLOCKS).glob("x*/y*.tif"):
             column, row = path.parent.name[1:], path.stem[1:]
             found.append((int(column), int(row)))
         return sorted(found)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import helpers_fuzz as fuzz
 import pytest
 
-SHORT = {"files": 60, "pipelines": 80, "transforms": 60, "models": 60, "bags": 60}
-LONG = {"files": 1000, "pipelines": 2000, "transforms": 1000, "models": 1000, "bags": 1000}
+SHORT = {"files": 60, "pipelines": 80, "transforms": 60, "models": 60, "bags": 60, "named": 40, "folders": 12}
+LONG = {
+    "files": 1000, "pipelines": 2000, "transforms": 1000, "models": 1000, "bags": 1000, "named": 1000,
+    "folders": 300,
+}  # fmt: skip
 
 
 def drill(kind: str, count: int, first: int, folder) -> None:
@@ -40,6 +43,8 @@ FOUND = {
     "bounds whose norm overflows": ("files", 30040),
     "points of which the check leaves out all": ("files", 40204),
     "points that a transform moves to infinity": ("files", 459),
+    "a floor of cells without number": ("files", 2_001_061),
+    "poses that are no places on earth": ("bags", 2_000_972),
 }
 
 

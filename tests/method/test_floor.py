@@ -5,7 +5,7 @@ import pytest
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.transforms import angle_deg, rotation_to_up
-from mtpcr_geo.method.floor import extent_of, floors_of
+from mtpcr_geo.method.floor import _lowest, extent_of, floors_of
 from mtpcr_geo.method.levelling import SAME_VERTICAL_DEG, evidence_of, level, verticals
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -85,3 +85,16 @@ def test_rotation_to_up_of_a_cloud_on_its_head_is_a_rotation() -> None:
     R = rotation_to_up(-UP)
     assert np.allclose(R @ -UP, UP)
     assert np.linalg.det(R) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("apart", [0.0, 5e3, 1e9, 1e17])
+def test_lowest_points_need_no_room_for_what_lies_between_two_sites(apart: float) -> None:
+    one = garden(np.random.default_rng(4))
+    xyz = np.vstack([one, one + [apart, -apart, 3.0]])
+    lowest = _lowest(xyz, 2.0)
+    low, high = np.percentile(xyz[:, :2], [0.5, 99.5], axis=0)
+    kept = xyz[((xyz[:, :2] >= low) & (xyz[:, :2] <= high)).all(axis=1)]
+    expected: dict[tuple[float, ...], float] = {}
+    for cell, z in zip(map(tuple, np.floor((kept[:, :2] - low) / 2.0)), kept[:, 2], strict=True):
+        expected[cell] = min(z, expected.get(cell, np.inf))
+    assert lowest[:, 2].tolist() == [expected[cell] for cell in sorted(expected)]
