@@ -20,7 +20,7 @@ from mtpcr_geo.pipeline.pdal.bindings import drivers
 
 EAST, NORTH = ORIGIN[:2].tolist()
 TRIANGLE = f"POLYGON(({EAST} {NORTH}, {EAST + 30} {NORTH}, {EAST + 30} {NORTH + 30}, {EAST} {NORTH}))"
-NAMED = {
+NAMED: dict[str, dict[str, Any]] = {
     "filters.assign": {"value": "Classification = 8"},
     "filters.chipper": {"capacity": 500},
     "filters.cluster": {"tolerance": 2.0},
