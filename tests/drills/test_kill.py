@@ -18,14 +18,14 @@ import os, signal, sys
 from pathlib import Path
 from mtpcr_geo.io.outputs import OutputSet
 
-place, at = Path(sys.argv[1]), int(sys.argv[2])
+place, at, number = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 calls = 0
 def counted(function):
     def call(*arguments, **named):
         global calls
         calls += 1
         if calls == at:
-            os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), number)
         return function(*arguments, **named)
     return call
 with OutputSet(overwrite=True) as outputs:
@@ -50,14 +50,15 @@ def found(place: Path) -> dict[str, str]:
     return {str(path.relative_to(place)): path.read_text() for path in place.rglob("*") if path.is_file()}
 
 
-def run(place: Path, at: int) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", CHILD, place, str(at)], capture_output=True, text=True, check=False
-    )
+def run(place: Path, at: int, number: int = signal.SIGTERM) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", CHILD, str(place), str(at), str(int(number))]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="needs SIGKILL")
-def test_killed_between_any_two_steps(tmp_path):
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGTERM", "SIGINT"])
+def test_killed_between_any_two_steps(name, tmp_path):
+    number = getattr(signal, name)
     fill(tmp_path / "whole")
     whole = run(tmp_path / "whole", 0)
     assert whole.returncode == 0, whole.stderr
@@ -68,12 +69,12 @@ def test_killed_between_any_two_steps(tmp_path):
     for at in range(1, steps + 1):
         place = tmp_path / str(at)
         fill(place)
-        assert run(place, at).returncode == -signal.SIGKILL
+        assert run(place, at, number).returncode == -number
         # the next run that writes there, whatever it writes, finishes or forgets what was begun
         with OutputSet(overwrite=True) as outputs:
-            for name in ("one.txt", "bev/two.txt", "three.txt"):
-                outputs.check(place / name)
-        left = {name: text for name, text in found(place).items() if not Path(name).name.startswith(".")}
+            for file in ("one.txt", "bev/two.txt", "three.txt"):
+                outputs.check(place / file)
+        left = {file: text for file, text in found(place).items() if not Path(file).name.startswith(".")}
         assert left in (BEFORE, AFTER), at
         states.append(left == AFTER)
         assert run(place, 0).returncode == 0

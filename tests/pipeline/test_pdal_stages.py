@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers_scene import ORIGIN, town
+from numpy.typing import NDArray
 
 import mtpcr_geo
 from mtpcr_geo.core.cloud import ArrayCloud
@@ -100,7 +101,7 @@ def cloud(tmp_path_factory: pytest.TempPathFactory):
 
     rng = np.random.default_rng(3)
     xyz = town(rng, 1500) + ORIGIN
-    extra = {
+    extra: dict[str, NDArray[np.generic]] = {
         "Classification": np.where(xyz[:, 2] > ORIGIN[2] + 5.0, 6, 2).astype(np.uint8),
         "Intensity": rng.integers(0, 2000, len(xyz)).astype(np.uint16),
         "ReturnNumber": np.ones(len(xyz), np.uint8),
