@@ -11,6 +11,7 @@ import pytest
 from helpers_las import SCALE, WKT, descriptor, points, write_raw
 from pyproj import CRS
 
+from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.io.las import LasCloud, open_cloud
 from mtpcr_geo.io.write import write_cloud
@@ -207,3 +208,16 @@ def test_kinds_that_are_not_supported_are_told_from_damage(tmp_path):
 
 def test_the_scale_of_the_helper_is_that_of_the_files(tmp_path):
     assert open_cloud(write_raw(tmp_path / "in.las")).header.scales[0] == SCALE
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_negative_scale_may_mirror_and_is_refused(tmp_path, axis):
+    path = tmp_path / "mirrored.las"
+    write_cloud(path, ArrayCloud(np.random.default_rng(1).uniform(0, 50, (500, 3))), None, None)
+    data = bytearray(path.read_bytes())
+    # the scales stand at byte 131 of a header of LAS, as doubles
+    at = 131 + 8 * axis
+    data[at : at + 8] = struct.pack("<d", -struct.unpack("<d", data[at : at + 8])[0])
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=f"negative scale in {'xyz'[axis]}"):
+        open_cloud(path)

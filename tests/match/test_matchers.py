@@ -582,6 +582,17 @@ def test_one_match_is_refused_by_the_solver():
         solve_tie_points(TiePoints(one, one, np.ones(1), np.ones(1, np.int64), no, ~no), 1.0)
 
 
+ELSEWHERE = """
+title = "x"
+kind = "keypoints"
+[origin]
+project = "p"
+licence = "l"
+[extractor]
+file = "{}"
+"""
+
+
 @pytest.mark.parametrize(
     ("text", "reported"),
     [
@@ -589,6 +600,9 @@ def test_one_match_is_refused_by_the_solver():
         ('title = "x"\nkind = "keypoints"\n[origin]\nproject="p"\nlicence="l"', "takes an .extractor. table"),
         ('title = "x"\nkind = "fuzed"\n[origin]\nproject="p"\nlicence="l"', "kind"),
         ('title = "x"\nkind = "fused"\nfilename = 3', "filename|fused|origin"),
+        (ELSEWHERE.format("../other.onnx"), "plain name"),
+        (ELSEWHERE.format("/etc/hostname"), "plain name"),
+        (ELSEWHERE.format("sub/mine.onnx"), "plain name"),
     ],
 )
 def test_wrong_descriptions_are_named(tmp_path, text, reported):
