@@ -84,9 +84,11 @@ def good(tmp_path_factory):
     return write(folder / "source.laz", source), write(folder / "target.laz", hills(2))
 
 
-def test_sound_clouds_have_no_findings(good):
+def test_of_sound_clouds_it_is_said_what_is_taken_of_their_heights_and_nothing_else(good):
     report = check_clouds(*good)
-    assert report.findings == ()
+    assert [(one.code, one.severity) for one in report.findings] == [("vertical-taken", "note")]
+    known = check_clouds(*good, source_crs="EPSG:25832+7837", target_crs="EPSG:25832+7837")
+    assert "vertical-taken" not in {one.code for one in known.findings}
     assert report.goes_on
     relation = report.relation
     assert relation is not None
@@ -623,7 +625,7 @@ def test_a_local_target_gives_a_result_without_a_crs(tmp_path):
         ("forest_plot_mls_uas", {"source_crs": "local"}, {"leans", "vertical-unknown"}),
         ("forest_plot_mls_uas", {"source_crs": "EPSG:6341+5703"}, set()),
         ("robot_scans", {"local": True}, {"leans", "stray"}),
-        ("suburb_dense_ign770", {}, set()),
+        ("suburb_dense_ign770", {}, {"vertical-taken"}),
         ("bcts_forest_strips", {}, set()),
     ],
 )

@@ -333,7 +333,8 @@ def test_a_place_that_cannot_be_meant(site, files, levelled):
         assert report.exit_code == OptionError.exit_code
         (finding,) = [one for one in report.findings if one.code == "near"]
         assert finding.severity == "error"
-        assert says in f"{finding.what}; {finding.fix}"
+        in_python = says.replace("--near-crs EPSG:4326", 'near_crs="EPSG:4326"')
+        assert in_python in f"{finding.what}; {finding.fix}"
     with pytest.raises(CrsError, match="longitude comes before latitude"):
         known_place(PriorOptions(near=(lat, 152.0), near_crs="EPSG:4326"), levelled, "stage match")
     report = check_clouds(*files, local=True, near=(lon, lat), near_crs="EPSG:4326")
