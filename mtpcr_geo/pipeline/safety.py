@@ -34,6 +34,10 @@ _CLOSED = {
     "log": "use --metadata and --verbose",
 }
 
+_WRITES_BESIDE = {
+    "filters.csf": "leaves files of its own in the current folder (filters.smrf finds ground too)",
+}
+
 
 def check(specs: Sequence[StageSpec], access: Access) -> None:
     """Refuse stages and options that run code or reach the network, and those that nobody knows.
@@ -70,6 +74,8 @@ def _check_known(spec: StageSpec) -> None:
     own = stage_types().get(spec.type)
     if own is not None:
         known |= set(own.Options.model_fields) | {"user_data"}
+    if spec.type in _WRITES_BESIDE:
+        raise OptionError(f"{spec.label} {_WRITES_BESIDE[spec.type]}; say --allow-code if it may do so")
     if not known:
         near = nearest(spec.type, ALLOWED)
         hint = f"; did you mean {near!r}?" if near else ""

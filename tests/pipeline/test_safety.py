@@ -47,6 +47,12 @@ def test_stages_that_run_code_or_that_nobody_knows_are_refused(kind):
     refuse({"type": kind, "anything": 1}, access=Access(code=True))
 
 
+def test_a_filter_that_writes_files_of_its_own_is_refused():
+    with pytest.raises(OptionError, match=r"leaves files of its own.*--allow-code"):
+        refuse({"type": "filters.csf"})
+    refuse({"type": "filters.csf"}, access=Access(code=True))
+
+
 def test_every_option_that_pdal_lists_is_allowed_or_left_out_on_purpose(pdal):
     left_out = {
         "log", "option_file", "reader_args",
@@ -54,9 +60,10 @@ def test_every_option_that_pdal_lists_is_allowed_or_left_out_on_purpose(pdal):
         "density", "dir", "bundledfile",
     }  # fmt: skip
     code = {"filters.shell", "filters.python", "readers.numpy"}
+    beside = {"filters.csf"}
     refused = {"writers.ept_addon", "filters.streamcallback", "readers.memoryview"}
     for name, driver in bindings.drivers().items():
-        if name in code | refused:
+        if name in code | refused | beside:
             assert name not in ALLOWED
         else:
             assert set(driver.options) - left_out <= ALLOWED[name], name

@@ -3,7 +3,8 @@
 An allow list: what it does not name is refused unless code is allowed. So no option of another PDAL, and none
 that PDAL does not list itself (``plugin`` loads any shared library), is let through for not being known. Left
 out on purpose are ``log``, ``option_file``, ``reader_args`` (options of other stages,
-past every check), and the options that write files outside the set of outputs.
+past every check), the options that write files outside the set of outputs, and ``filters.csf``, which writes
+some of its own into the current folder, whatever its options.
 """
 
 from __future__ import annotations
@@ -69,7 +70,6 @@ _OPTIONS = {
     "filters.covariancefeatures": "knn threads feature_set stride radius min_k mode optimized",
     "filters.cpd": "method",
     "filters.crop": "outside a_srs bounds point distance polygon ogr",
-    "filters.csf": "smooth step threshold resolution rigidness iterations hdiff ignore returns",
     "filters.dbscan": "min_points eps dimensions",
     "filters.decimation": "step offset limit",
     "filters.delaunay": "",
