@@ -55,7 +55,11 @@ def read_pose(path: Path) -> TransformChain | Floats:
         shifts = [_shift(text, role) for role in ("source", "target")]
     except ValueError as error:
         raise InputError(f"{path} states a global shift that is none ({error})") from error
-    return np.asarray(transforms.translation(-shifts[1]) @ T @ transforms.translation(shifts[0]))
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved = transforms.translation(-shifts[1]) @ T @ transforms.translation(shifts[0])
+    if not np.isfinite(moved).all():
+        raise InputError(f"{path} states numbers that are too large to be a pose")
+    return np.asarray(moved)
 
 
 def _shift(text: str, role: str) -> Floats:

@@ -150,6 +150,8 @@ def _read(place: Path) -> dict[str, Any]:
             isinstance(one, dict) and isinstance(one.get("type"), str) and isinstance(one.get("tag"), str)
         ):
             raise InputError(f"{short(path)}: the pipeline recorded holds something that is no stage")
+        if not isinstance(one.get("inputs", []), str | list):
+            raise InputError(f"{short(path)}: the inputs of a stage recorded are no tags")
     if any(one["type"] == MemoryReader.type for one in record["pipeline"]):
         raise InputError(
             f"{short(path)}: a cloud of this run was in memory, not in a file, and is not there any more"
@@ -157,7 +159,22 @@ def _read(place: Path) -> dict[str, Any]:
     for one in record["inputs"]:
         if not (isinstance(one, dict) and isinstance(one.get("path"), str)):
             raise InputError(f"{short(path)}: an input recorded has no path")
+    if not all(isinstance(one, dict) for one in record["options"].values()):
+        raise InputError(f"{short(path)}: the options recorded of a stage are none")
+    T = record.get("T_target_source")
+    if T is not None and not _is_matrix(T):
+        raise InputError(f"{short(path)}: the transform recorded is no 4x4")
     return record
+
+
+def _is_matrix(value: object) -> bool:
+    """Return whether a value of JSON is four rows of four numbers."""
+    return (
+        isinstance(value, list)
+        and len(value) == 4
+        and all(isinstance(row, list) and len(row) == 4 for row in value)
+        and all(type(one) in (int, float) and abs(one) < 1e300 for row in value for one in row)
+    )
 
 
 def _base(record: Mapping[str, Any], place: Path) -> Path:

@@ -249,14 +249,14 @@ def _row_of(folder: Path, job: Job) -> Row | None:
 
 
 def _is_placed(row: Row) -> bool:
-    """Return whether the outline of a row is one, and its CRS can be read."""
-    from pyproj import CRS
+    """Return whether the outline of a row is one, and its CRS one that PROJ works with."""
+    from pyproj import CRS, Transformer
     from pyproj.exceptions import ProjError
 
     if len(row.footprint) % 2 or not np.isfinite(row.footprint).all():
         return False
     try:
-        return not row.crs or bool(CRS.from_wkt(row.crs).name)
+        return not row.crs or bool(Transformer.from_crs(CRS.from_wkt(row.crs), "EPSG:4326").definition)
     except (ProjError, UnicodeError):
         return False
 

@@ -45,6 +45,11 @@ FOUND = {
     "points that a transform moves to infinity": ("files", 459),
     "a floor of cells without number": ("files", 2_001_061),
     "poses that are no places on earth": ("bags", 2_000_972),
+    "a global shift too large for a pose": ("named", 100126),
+    "options of a recorded stage that are none": ("folders", 100228),
+    "a recorded transform that is no 4x4": ("folders", 100267),
+    "inputs of a recorded stage that are no tags": ("folders", 300103),
+    "a CRS in a batch that PROJ does not work with": ("folders", 300688),
 }
 
 
