@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import collections
+import copy
 import faulthandler
 import json
 import random
@@ -333,13 +334,13 @@ def change(rng: random.Random, tree: Any) -> None:
         if (isinstance(other, dict) and at in other) or (isinstance(other, list) and at < len(other)):
             node[key] = json.loads(json.dumps(other[at]))
     elif way == 2 and isinstance(node, dict):
-        node[rng.choice([*map(str, VALUES), "filename", "type", "tag", "inputs", "cell"])] = rng.choice(
-            VALUES
-        )
+        # a copy: what is changed in one try must not be there in the next
+        value = copy.deepcopy(rng.choice(VALUES))
+        node[rng.choice([*map(str, VALUES), "filename", "type", "tag", "inputs", "cell"])] = value
     elif way == 3 and isinstance(node, list):
-        node.insert(key, rng.choice(VALUES))
+        node.insert(key, copy.deepcopy(rng.choice(VALUES)))
     else:
-        node[key] = rng.choice(VALUES)
+        node[key] = copy.deepcopy(rng.choice(VALUES))
 
 
 def letters_changed(rng: random.Random, text: str) -> str:
