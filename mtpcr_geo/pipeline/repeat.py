@@ -20,6 +20,7 @@ from mtpcr_geo.core.paths import read_whole, short
 from mtpcr_geo.core.progress import Progress
 from mtpcr_geo.core.system import sha256, versions
 from mtpcr_geo.crs.chain import TransformChain
+from mtpcr_geo.export.prior_file import matrix_of
 from mtpcr_geo.export.run_json import plain
 from mtpcr_geo.pipeline import grammar
 from mtpcr_geo.pipeline.options import OUTPUT_NAMES
@@ -161,20 +162,10 @@ def _read(place: Path) -> dict[str, Any]:
             raise InputError(f"{short(path)}: an input recorded has no path")
     if not all(isinstance(one, dict) for one in record["options"].values()):
         raise InputError(f"{short(path)}: the options recorded of a stage are none")
-    T = record.get("T_target_source")
-    if T is not None and not _is_matrix(T):
-        raise InputError(f"{short(path)}: the transform recorded is no 4x4")
+    if record.get("T_target_source") is not None:
+        T = matrix_of(record["T_target_source"], f"the transform recorded in {short(path)}")
+        record["T_target_source"] = T.tolist()
     return record
-
-
-def _is_matrix(value: object) -> bool:
-    """Return whether a value of JSON is four rows of four numbers."""
-    return (
-        isinstance(value, list)
-        and len(value) == 4
-        and all(isinstance(row, list) and len(row) == 4 for row in value)
-        and all(type(one) in (int, float) and abs(one) < 1e300 for row in value for one in row)
-    )
 
 
 def _base(record: Mapping[str, Any], place: Path) -> Path:
