@@ -183,6 +183,7 @@ def read_frame(folder: Path) -> Frame:
         InputError: if there is none, or it is damaged.
 
     """
+    from pyproj import Transformer
     from pyproj.exceptions import ProjError
 
     try:
@@ -195,6 +196,8 @@ def read_frame(folder: Path) -> Frame:
         frame = Frame(str(data["crs_wkt"]), *lengths)
         if not frame.crs.is_projected:
             raise ValueError(f"{frame.crs.name} is no projected CRS")
+        # a CRS may be read and yet be none that PROJ works with
+        Transformer.from_crs(frame.crs, "EPSG:4326")
         return frame
     except FileNotFoundError as error:
         raise InputError(f"{folder} is no survey: it has no {SURVEY}; make one by survey build") from error

@@ -49,6 +49,7 @@ FOUND = {
     "options of a recorded stage that are none": ("folders", 100228),
     "a recorded transform that is no 4x4": ("folders", 100267),
     "inputs of a recorded stage that are no tags": ("folders", 300103),
+    "a CRS of a survey that PROJ does not work with": ("folders", 601289),
     "a CRS in a batch that PROJ does not work with": ("folders", 300688),
 }
 
