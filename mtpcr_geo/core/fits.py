@@ -149,6 +149,7 @@ class IcpResult(ComparesArrays):
         chosen: name of the candidate taken.
         followed: whether it is a run of ICP.
         lost_tie_points: whether a run whose surfaces met better was not followed, since it lost tie points.
+        contested: the same, by however little they met better.
         rounds: rounds of the run that was followed.
         rotated_deg: angle by which it turned the start, degrees; None where none was followed.
         fine: the last round at a finer thinning, where the density bears one.
@@ -171,6 +172,7 @@ class IcpResult(ComparesArrays):
     fine: IcpRound | None = None
     fine_voxel_m: float | None = None
     T_surfaces: Floats | None = None
+    contested: bool = False
 
     def audit(self) -> dict[str, Any]:
         """Return the figures of the runs, for the audit."""

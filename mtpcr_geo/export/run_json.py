@@ -313,6 +313,8 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
   where that was too far and plan and yaw were left as the tie points have them
 - ``mtpcr.refine levelled_again``: whether the source was levelled by the vertical that ICP found, matched and
   solved again; then the figures are those of the second refinement
+- ``mtpcr.refine matched_again_cell_m``: where surfaces met better beside the tie points, and new tie points
+  on coarser rasters agreed with that: cell of those, metres; then the figures are of the second refinement
 - ``mtpcr.refine tilt_deg``: angle between the source's z axis and that vertical
 - ``mtpcr.assess verdict``: as above
 - ``mtpcr.assess reasons``: as above

@@ -304,12 +304,13 @@ def follow_icp(
         (name for name in kept if name != BETWEEN),
         key=lambda name: trials[name].surface_residual * (1.0 if name in runs else CLEARLY),
     )
-    lost = [
+    better = [
         name
         for name in runs
-        if name not in kept
-        and trials[name].surface_residual < trials[best].surface_residual * (MUCH if best in runs else 1.0)
+        if name not in kept and trials[name].surface_residual < trials[best].surface_residual
     ]
+    much = trials[best].surface_residual * (MUCH if best in runs else 1.0)
+    lost = [name for name in better if trials[name].surface_residual < much]
     if (
         best in runs
         and BETWEEN in kept
@@ -336,6 +337,7 @@ def follow_icp(
         rounds=run.rounds if run is not None else (),
         rotated_deg=rotated,
         T_surfaces=min(runs.items(), key=lambda one: trials[one[0]].surface_residual)[1].T,
+        contested=bool(better),
     )
 
 

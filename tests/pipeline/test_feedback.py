@@ -1,12 +1,21 @@
-"""A vertical that the refinement found, fed back: when a second search bears it out."""
+"""What the refinement found, fed back: when a second search bears it out."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from helpers_scene import houses
 
+from mtpcr_geo import register
+from mtpcr_geo.core import transforms
 from mtpcr_geo.core.fits import IcpResult, IcpTrial, Refinement
-from mtpcr_geo.pipeline.stages.feedback import CLOSER, borne_out
+from mtpcr_geo.core.types import Bev, Pair, Side
+from mtpcr_geo.method.bev import make_bev
+from mtpcr_geo.method.refine import RefineSettings, refine
+from mtpcr_geo.pipeline.stages.feedback import CLOSER, borne_out, matched_coarser
+from mtpcr_geo.verdict.evidence import tie_points_agreeing
 
 
 def refined(residual: float, *, followed: bool, lost: bool) -> Refinement:
@@ -37,3 +46,78 @@ def test_weaker_matches_bear_a_vertical_out_where_surfaces_then_meet(
 
 def test_nothing_is_borne_out_where_surfaces_and_tie_points_agreed_before() -> None:
     assert not borne_out(refined(0.9, followed=True, lost=False), refined(0.4, followed=True, lost=False))
+
+
+@pytest.fixture(scope="module")
+def registered() -> tuple[Pair, np.ndarray]:
+    """A registered pair of a town, and the true transform in work coordinates."""
+    rng = np.random.default_rng(3)
+    T = transforms.compose(transforms.yaw_matrix(np.radians(40.0)), np.array([20.0, -9.0, 1.0]))
+    source, target = houses(rng, 60_000), houses(rng, 60_000)
+    found = register(transforms.apply(transforms.inverse(T), source), target, local=True)
+    assert found.pair is not None
+    assert found.T_target_source is not None
+    corners = np.array([[40.0, 40.0, 0.0], [-40.0, 40.0, 0.0], [0.0, -40.0, 5.0]])
+    np.testing.assert_allclose(
+        transforms.apply(found.T_target_source @ transforms.inverse(T), corners), corners, atol=0.02
+    )
+    assert found.pair.T_target_source is not None
+    return found.pair, found.pair.T_target_source
+
+
+def beside(pair: Pair, T: np.ndarray, by: tuple[float, float, float]) -> tuple[Pair, Refinement]:
+    """The pair as if every tie point were wrong by the same step, and the refinement from there."""
+    assert pair.tie_points is not None
+    step = transforms.compose(np.eye(3), np.array(by))
+    ties = replace(pair.tie_points, target=pair.tie_points.target + np.array(by))
+    off = pair.with_(tie_points=ties, T_target_source=step @ T, refinement=None, verdict=None)
+    refined = refine(
+        off.source.sample,
+        off.target.sample,
+        step @ T,
+        RefineSettings(),
+        cell=off.cell,
+        agreeing=lambda one: tie_points_agreeing(off, one),
+    )
+    return off, refined
+
+
+def raster(side: Side, cell: float) -> Bev:
+    return make_bev(side.levelled_sample, cell)
+
+
+def test_tie_points_beside_the_surfaces_are_sought_again_at_coarser_cells(registered) -> None:
+    pair, T = registered
+    off, refined = beside(pair, T, (1.6, 0.0, 0.0))
+    assert refined.icp is not None
+    assert refined.icp.contested
+    again = matched_coarser(off, refined, RefineSettings(), raster)
+    assert again is not None
+    assert again.T_target_source is not None
+    assert again.cell > pair.cell
+    places = transforms.apply(transforms.inverse(T), np.array([[40.0, 40.0, 0.0], [-40.0, -40.0, 0.0]]))
+    apart = transforms.apply(again.T_target_source, places) - transforms.apply(T, places)
+    assert np.abs(apart).max() < 0.03
+
+
+def test_nothing_is_sought_again_where_tie_points_and_surfaces_agree(registered) -> None:
+    pair, T = registered
+    off, refined = beside(pair, T, (0.0, 0.0, 0.0))
+    assert matched_coarser(off, refined, RefineSettings(), raster) is None
+
+
+def test_surfaces_that_slid_away_are_not_borne_out_by_coarser_cells(registered) -> None:
+    pair, T = registered
+    off, refined = beside(pair, T, (1.6, 0.0, 0.0))
+    assert refined.icp is not None
+    away = transforms.compose(np.eye(3), np.array([0.0, 6.0, 0.0])) @ T
+    slid = replace(refined, icp=replace(refined.icp, T_surfaces=away))
+    assert matched_coarser(off, slid, RefineSettings(), raster) is None
+
+
+def test_a_pose_in_doubt_is_not_sought_again(registered) -> None:
+    pair, T = registered
+    off, refined = beside(pair, T, (1.6, 0.0, 0.0))
+    assert off.matches is not None
+    unsure = off.with_(matches=replace(off.matches, margin=1.1))
+    assert matched_coarser(unsure, refined, RefineSettings(), raster) is None

@@ -1,8 +1,9 @@
-"""The refinement's vertical fed back once: level the source by it, rasterise, match and solve again.
+"""The refinement fed back once, where tie points and surfaces contradict each other: match and solve again.
 
 Tie points matched under a wrong vertical agree with a wrong transform. Where a vertical is not known and ICP,
 following the surfaces alone, tilts the source, those tie points cannot judge that; the ones found under the
-new vertical can.
+new vertical can. And where cells are hardly filled, what matches may be the pattern of the points and not
+what they lie on: tie points then agree a cell or two beside the truth, and those of coarser cells do not.
 """
 
 from __future__ import annotations
@@ -26,6 +27,12 @@ from mtpcr_geo.verdict.evidence import tie_points_agreeing
 LEAST_TILT_DEG = 0.3
 """Tilt left between the levelled clouds from which on a new vertical is worth a second search."""
 MOST_TILT_DEG = 30.0
+COARSER = 1.5
+"""Times the cell at which clouds are matched again where surfaces and tie points contradict each other: its
+cells hold twice as many points, and small plots still have cells enough."""
+SURE = 1.3
+"""Strength over the next hypothesis, and over the mirrored source's best, below which the pose itself is in
+doubt, and no second search about a cell or two is worth its time."""
 WEAKEST, CLOSER = 0.5, 0.8
 """Share of the first matches' strength that those under a new vertical have at least, and of the surfaces'
 residual that is left at most where they are weaker: of a right one under 0.5 is left."""
@@ -106,6 +113,64 @@ def fed_back(
     if strength < before and not borne_out(refined, refinement):
         return None
     return again.with_(T_target_source=refinement.T, refinement=refinement)
+
+
+def matched_coarser(
+    pair: Pair, refined: Refinement, settings: RefineSettings, rasterise: Callable[[Side, float], Bev]
+) -> Pair | None:
+    """Register again at a coarser cell where a run of ICP fits better than what the tie points agree with.
+
+    Either the surfaces are right, which many more points have seen, or they slid along open ground. Tie
+    points found anew, on rasters whose cells hold twice as many points, decide which: only where they agree
+    with the place that the surfaces chose is it taken.
+
+    Args:
+        pair: solved, with matches and rasters.
+        refined: what the refinement came to.
+        settings: of the refinement.
+        rasterise: makes the raster of a side at a cell, metres.
+
+    Returns:
+        The pair matched, solved and refined at the coarser cell, or None where nothing contradicts the tie
+        points, the search was not sure of the pose, or the tie points of the coarser cell lead elsewhere.
+
+    """
+    matches, icp = pair.matches, refined.icp
+    if matches is None or matches.matcher is None or matches.matcher.needs_image:
+        return None
+    if icp is None or not icp.contested or icp.T_surfaces is None or settings.motion != "rigid":
+        return None
+    if (matches.margin or 0.0) < SURE or (matches.null_ratio is not None and matches.null_ratio < SURE):
+        return None
+    cell = COARSER * pair.cell
+    sides = [replace(side, bev=rasterise(side, cell), appearance=None) for side in (pair.source, pair.target)]
+    again = pair.with_(source=sides[0], target=sides[1], refinement=None)
+    try:
+        again = _solved(again, pair)
+    except RegistrationError:
+        return None
+    assert again.T_target_source is not None
+    refinement = refine(
+        again.source.sample,
+        again.target.sample,
+        again.T_target_source,
+        settings,
+        cell=again.cell,
+        agreeing=lambda T: tie_points_agreeing(again, T),
+    )
+    if not _same_place(pair, refinement, icp.T_surfaces):
+        return None
+    return again.with_(T_target_source=refinement.T, refinement=refinement)
+
+
+def _same_place(pair: Pair, after: Refinement, T_surfaces: Floats) -> bool:
+    """Whether tie points and surfaces meet at the coarser cell, and where the surfaces had met before."""
+    assert pair.tie_points is not None
+    if after.icp is None or not after.icp.followed or after.icp.contested:
+        return False
+    places = transforms.apply(transforms.inverse(pair.source.T_level_work), pair.tie_points.source)
+    apart = transforms.apply(after.T, places) - transforms.apply(T_surfaces, places)
+    return bool(np.linalg.norm(apart, axis=1).mean() <= tolerance_for(pair.cell))
 
 
 def borne_out(before: Refinement, after: Refinement) -> bool:

@@ -12,7 +12,7 @@ from pydantic import Field
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import OptionError, RegistrationError
-from mtpcr_geo.core.types import Pair, Refinement, SolveSettings
+from mtpcr_geo.core.types import Bev, Pair, Refinement, Side, SolveSettings
 from mtpcr_geo.method.scales import tolerance_for
 from mtpcr_geo.pipeline.options import Motion, Seed
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
@@ -152,8 +152,8 @@ class RefineOptions(StageOptions):
     ground: bool = Field(True, description="settle height and tilt on the ground before, and height after")
     feedback: bool = Field(
         True,
-        description="where a vertical is not known and ICP tilts the source: level it by that, match and "
-        "solve again once",
+        description="match and solve again once where a vertical is not known and ICP tilts the source, "
+        "levelled by that; or where surfaces fit better beside the tie points, at a coarser cell",
     )
     keep_tie_points: float = Field(
         0.5,
@@ -180,7 +180,7 @@ class Refine(Stage):
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Refine the solved transform."""
         from mtpcr_geo.method.refine import RefineSettings, refine
-        from mtpcr_geo.pipeline.stages.feedback import fed_back
+        from mtpcr_geo.pipeline.stages.feedback import fed_back, matched_coarser
         from mtpcr_geo.pipeline.stages.rasters import rasterised
         from mtpcr_geo.verdict.evidence import tie_points_agreeing
 
@@ -210,17 +210,26 @@ class Refine(Stage):
             pivot=_middle_of_tie_points(pair),
             R_upright=pair.target.T_level_work[:3, :3].T @ pair.source.T_level_work[:3, :3],
         )
+
+        def raster_at(side: Side, cell: float) -> Bev:
+            return rasterised(side, cell, "centre", context)
+
         trusted = pair.source.levelling.trusted and pair.target.levelling.trusted
         if not trusted and options.feedback:
-            again = fed_back(
-                pair, refinement, settings, lambda side, cell: rasterised(side, cell, "centre", context)
-            )
+            again = fed_back(pair, refinement, settings, raster_at)
             if again is not None and again.refinement is not None:
                 tilt = again.source.levelling.tilt_deg
                 if options.keep_tie_points:
                     again = _held(again, again.refinement)
                 assert again.refinement is not None
                 self.metadata |= {"levelled_again": True, "tilt_deg": tilt, **again.refinement.audit()}
+                return again
+        if options.feedback and options.keep_tie_points:
+            again = matched_coarser(pair, refinement, settings, raster_at)
+            if again is not None and again.refinement is not None:
+                again = _held(again, again.refinement)
+                assert again.refinement is not None
+                self.metadata |= {"matched_again_cell_m": again.cell, **again.refinement.audit()}
                 return again
         pair = pair.with_(T_target_source=refinement.T, refinement=refinement)
         if options.keep_tie_points:
