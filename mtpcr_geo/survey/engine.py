@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from mtpcr_geo.core.errors import InputError, MissingPartError, MtpcrError
-from mtpcr_geo.core.system import usable_cores
+from mtpcr_geo.core.system import cores, usable_cores
 from mtpcr_geo.survey.options import EngineOptions
 
 Item = TypeVar("Item")
@@ -54,10 +54,17 @@ class Engine:
 
 
 class DaskEngine(Engine):
-    """Does pieces of work on the workers of a Dask client."""
+    """Does pieces of work on the workers of a Dask client.
 
-    def __init__(self, client: Any) -> None:
+    Args:
+        client: of the cluster.
+        cores_each: processor cores that a piece of work may use; 0 for all of its machine's.
+
+    """
+
+    def __init__(self, client: Any, cores_each: int = 0) -> None:
         self.client = client
+        self.cores_each = cores_each
 
     def run(
         self, work: Callable[[Item], Made], items: Sequence[Item], retries: int = 3
@@ -66,7 +73,8 @@ class DaskEngine(Engine):
         from distributed import as_completed
 
         futures = {
-            self.client.submit(_tried, work, item, pure=False, retries=retries): item for item in items
+            self.client.submit(_tried, work, item, self.cores_each, pure=False, retries=retries): item
+            for item in items
         }
         for future in as_completed(list(futures), loop=self.client.loop):
             item = futures.pop(future)
@@ -78,9 +86,10 @@ class DaskEngine(Engine):
             future.release()
 
 
-def _tried(work: Callable[[Any], Any], item: Any) -> tuple[Any, str | None]:
+def _tried(work: Callable[[Any], Any], item: Any, most: int = 0) -> tuple[Any, str | None]:
     try:
-        return work(item), None
+        with cores(most):
+            return work(item), None
     except MtpcrError as error:
         return None, f"{type(error).__name__}: {error}"
 
@@ -150,4 +159,5 @@ def engine_of(options: EngineOptions, most: int) -> Iterator[Engine]:
             ) as cluster,
             Client(cluster, set_as_default=False) as client,
         ):
-            yield DaskEngine(client)
+            # workers of one machine share its cores: each taking all of them only gets in the others' way
+            yield DaskEngine(client, max(1, usable_cores() // wanted))

@@ -13,7 +13,9 @@ from typer.testing import CliRunner
 from mtpcr_geo.cli.app import app
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import InputError, OptionError, OutputError
+from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.survey.batch import run_batch
+from mtpcr_geo.survey.engine import _tried
 from mtpcr_geo.survey.jobs import jobs_of
 from mtpcr_geo.survey.options import BatchOptions
 
@@ -130,3 +132,8 @@ def test_the_command_says_what_failed(clouds: Path, tmp_path: Path) -> None:
     assert "1 failed" in result.stdout
     assert "none.laz" in result.stderr
     assert json.loads((tmp_path / "out" / "rows" / "none.json").read_text())["verdict"] == "failed"
+
+
+def test_a_piece_of_work_takes_no_more_cores_than_its_share() -> None:
+    assert _tried(lambda _: usable_cores(), None, 1) == (1, None)
+    assert _tried(lambda _: usable_cores(), None) == (usable_cores(), None)
