@@ -15,7 +15,7 @@ from mtpcr_geo.method.images import channels
 from mtpcr_geo.survey.mosaic import FACTORS, Mosaic
 
 MARGIN_M = 24.0
-"""Read beyond a window on each side: heights are band-passed by blurs of 12 m."""
+"""Read beyond a window on each side: twice the width of the blur that band-passes heights."""
 
 
 @dataclass(frozen=True)

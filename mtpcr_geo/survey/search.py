@@ -33,7 +33,7 @@ from mtpcr_geo.match.exploration import (
 from mtpcr_geo.match.judge import CLEAR_MARGIN, Judge
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.prior import Prior
-from mtpcr_geo.match.pyramid import LARGEST_SEARCH, Pyramid
+from mtpcr_geo.match.pyramid import COARSEST_SEARCH_M, LARGEST_SEARCH, Pyramid
 from mtpcr_geo.match.search import GlobalSearch, Layer, distinct
 from mtpcr_geo.match.terrain import Terrain
 from mtpcr_geo.method.bev import coarsen
@@ -43,7 +43,6 @@ from mtpcr_geo.method.scales import Scales, filled_share, occupied_area, scales_
 from mtpcr_geo.survey.levels import MARGIN_M, Ground, widened, windows
 from mtpcr_geo.survey.mosaic import FACTORS
 
-COARSEST_M = 8.0
 FEWEST_ACROSS = 24
 """Cells along the source's raster that the coarsest level leaves at least."""
 LEVELS = 2
@@ -231,7 +230,7 @@ class _Search:
     def _factors(self) -> list[int]:
         """Choose the levels that are searched over all yaws, coarsest first."""
         across = max(self.both[0].grid.shape)
-        wanted = max(min(across / FEWEST_ACROSS, COARSEST_M / self.cell), 1.0)
+        wanted = max(min(across / FEWEST_ACROSS, COARSEST_SEARCH_M / self.cell), 1.0)
         # the turned source must leave most of a window to search
         least = 4.0 * self.both[0].reach_m / self.cell / LARGEST_SEARCH
         fitting = [factor for factor in FACTORS if factor >= least] or [FACTORS[-1]]

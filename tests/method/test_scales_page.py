@@ -17,7 +17,7 @@ from mtpcr_geo.verdict.evidence import FAR_TOLERANCES, FAR_TURN_DEG
 
 PACKAGE = Path(mtpcr_geo.__file__).parent
 PAGE = PACKAGE.parent / "docs" / "scales.md"
-ROOMS = ("method", "match", "verdict")
+ROOMS = ("method", "match", "verdict", "survey")
 
 pytestmark = pytest.mark.skipif(not PAGE.is_file(), reason="needs docs/ of the checkout beside the package")
 
@@ -49,7 +49,7 @@ def constants() -> dict[str, tuple[float, ...]]:
                 ]
                 value = ast.literal_eval(node.value) if any(name.endswith("_M") for name in names) else ()
                 for name, one in zip(names, value if several else (value,), strict=False):
-                    if name.endswith("_M"):
+                    if name.endswith("_M") and not name.startswith("_"):
                         values[name] = tuple(one) if isinstance(one, tuple) else (float(one),)
     return values
 
