@@ -109,6 +109,7 @@ def test_chunks_are_those_of_one_file(clouds, size):
     assert np.array_equal(scan(one, budget=5_000).sample, scan(many, budget=5_000).sample)
 
 
+@pytest.mark.slow
 def test_tiles_give_the_same_transform_to_the_bit_and_a_source_of_five_comes_back_as_five(clouds, tmp_path):
     folder, source, _ = clouds
     one = mg.register(folder / "source.laz", folder / "target.laz", tmp_path / "one", recording=False)

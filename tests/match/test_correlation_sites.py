@@ -73,6 +73,7 @@ def test_the_terrain_tells_one_period_of_a_planting_from_the_next(yaw_deg: float
     assert spreads[0] == min(one for one in spreads if one is not None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("yaw_deg", [0.0, 77.0])
 def test_a_planting_that_is_not_the_same_is_never_accepted(yaw_deg: float) -> None:
     rng = np.random.default_rng(2)

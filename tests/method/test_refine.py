@@ -61,6 +61,7 @@ def test_icp_does_not_hang_on_its_start_or_on_round_off(clouds) -> None:
     assert np.linalg.norm(again - plain, axis=1).max() < 0.001
 
 
+@pytest.mark.slow
 def test_exchanged_clouds_are_refined_to_the_inverse(clouds) -> None:
     source, target = clouds[0][:40_000], clouds[1]
     start = off_by(0.4, (0.4, -0.3, 0.2))
