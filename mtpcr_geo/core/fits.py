@@ -207,6 +207,7 @@ class Refinement(ComparesArrays):
         equations: of the last round of ICP, in blocks; None where none was followed.
         slid_m: how far ICP had slid in plan where plan and yaw were left as the tie points have them, metres;
             None where they were not.
+        again: why clouds were matched and solved a second time before, for people; None where they were not.
 
     """
 
@@ -217,6 +218,7 @@ class Refinement(ComparesArrays):
     ground_after: GroundFit | None = None
     equations: BlockEquations | None = None
     slid_m: float | None = None
+    again: str | None = None
 
     def audit(self) -> dict[str, Any]:
         """Return what each step did, for the audit."""

@@ -179,9 +179,11 @@ def transform_rows(pair: Pair) -> list[Row]:
         rows.append(("height offset found", f"{offset:+.3f} m, added to the source's heights"))
     if pair.tie_points is not None and len(pair.tie_points.target):
         rows += _tie_point_rows(pair)
-    icp = pair.refinement.icp if pair.refinement is not None else None
-    if icp is not None:
-        rows.append(("refined by", refinement_text(icp)))
+    if pair.refinement is not None:
+        if pair.refinement.icp is not None:
+            rows.append(("refined by", refinement_text(pair.refinement.icp)))
+        if pair.refinement.again is not None:
+            rows.append(("fed back", pair.refinement.again))
     return rows
 
 

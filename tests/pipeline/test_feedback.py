@@ -12,6 +12,7 @@ from mtpcr_geo import register
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.fits import IcpResult, IcpTrial, Refinement
 from mtpcr_geo.core.types import Bev, Pair, Side
+from mtpcr_geo.export.descriptions import transform_rows
 from mtpcr_geo.method.bev import make_bev
 from mtpcr_geo.method.refine import RefineSettings, refine
 from mtpcr_geo.pipeline.stages.feedback import CLOSER, borne_out, matched_coarser
@@ -53,7 +54,7 @@ def registered() -> tuple[Pair, np.ndarray]:
     """A registered pair of a town, and the true transform in work coordinates."""
     rng = np.random.default_rng(3)
     T = transforms.compose(transforms.yaw_matrix(np.radians(40.0)), np.array([20.0, -9.0, 1.0]))
-    source, target = houses(rng, 60_000), houses(rng, 60_000)
+    source, target = houses(rng, 30_000), houses(rng, 30_000)
     found = register(transforms.apply(transforms.inverse(T), source), target, local=True)
     assert found.pair is not None
     assert found.T_target_source is not None
@@ -95,6 +96,8 @@ def test_tie_points_beside_the_surfaces_are_sought_again_at_coarser_cells(regist
     assert again is not None
     assert again.T_target_source is not None
     assert again.cell > pair.cell
+    assert again.refinement is not None
+    assert ("fed back", again.refinement.again) in transform_rows(again)
     places = transforms.apply(transforms.inverse(T), np.array([[40.0, 40.0, 0.0], [-40.0, -40.0, 0.0]]))
     apart = transforms.apply(again.T_target_source, places) - transforms.apply(T, places)
     assert np.abs(apart).max() < 0.03

@@ -112,7 +112,8 @@ def fed_back(
     )
     if strength < before and not borne_out(refined, refinement):
         return None
-    return again.with_(T_target_source=refinement.T, refinement=refinement)
+    why = "levelled, matched and solved again by the vertical that ICP had found"
+    return again.with_(T_target_source=refinement.T, refinement=replace(refinement, again=why))
 
 
 def matched_coarser(
@@ -160,7 +161,8 @@ def matched_coarser(
     )
     if not _same_place(pair, refinement, icp.T_surfaces):
         return None
-    return again.with_(T_target_source=refinement.T, refinement=refinement)
+    why = f"matched and solved again in cells of {cell:g} m: surfaces met better beside the first tie points"
+    return again.with_(T_target_source=refinement.T, refinement=replace(refinement, again=why))
 
 
 def _same_place(pair: Pair, after: Refinement, T_surfaces: Floats) -> bool:
