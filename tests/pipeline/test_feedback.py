@@ -118,6 +118,24 @@ def test_surfaces_that_slid_away_are_not_borne_out_by_coarser_cells(registered) 
     assert matched_coarser(off, slid, RefineSettings(), raster) is None
 
 
+def test_a_refinement_held_to_wrong_tie_points_is_heard_again(registered) -> None:
+    pair, T = registered
+    off, refined = beside(pair, T, (1.6, 0.0, 0.0))
+    assert refined.icp is not None
+    assert off.T_target_source is not None
+    held = replace(refined, icp=replace(refined.icp, contested=False), T=off.T_target_source, slid_m=1.6)
+    again = matched_coarser(off, held, RefineSettings(), raster)
+    assert again is not None
+    assert again.T_target_source is not None
+    np.testing.assert_allclose(again.T_target_source, T, atol=0.03)
+
+
+def test_a_slide_of_less_than_a_cell_is_not_sought_again(registered) -> None:
+    pair, T = registered
+    off, refined = beside(pair, T, (0.0, 0.0, 0.0))
+    assert matched_coarser(off, replace(refined, slid_m=0.9 * pair.cell), RefineSettings(), raster) is None
+
+
 def test_a_pose_in_doubt_is_not_sought_again(registered) -> None:
     pair, T = registered
     off, refined = beside(pair, T, (1.6, 0.0, 0.0))

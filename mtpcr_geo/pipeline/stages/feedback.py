@@ -119,15 +119,15 @@ def fed_back(
 def matched_coarser(
     pair: Pair, refined: Refinement, settings: RefineSettings, rasterise: Callable[[Side, float], Bev]
 ) -> Pair | None:
-    """Register again at a coarser cell where a run of ICP fits better than what the tie points agree with.
+    """Register again at a coarser cell where ICP went, or would go, elsewhere than the tie points.
 
-    Either the surfaces are right, which many more points have seen, or they slid along open ground. Tie
-    points found anew, on rasters whose cells hold twice as many points, decide which: only where they agree
-    with the place that the surfaces chose is it taken.
+    Either the surfaces are right, which many more points have seen, or they slid along open ground or along
+    rows. Tie points found anew, on rasters whose cells hold twice as many points, decide which: only where
+    they agree with the place that the surfaces chose is it taken.
 
     Args:
         pair: solved, with matches and rasters.
-        refined: what the refinement came to.
+        refined: what the refinement came to; if it was held to the tie points, ICP is heard again.
         settings: of the refinement.
         rasterise: makes the raster of a side at a cell, metres.
 
@@ -139,7 +139,9 @@ def matched_coarser(
     matches, icp = pair.matches, refined.icp
     if matches is None or matches.matcher is None or matches.matcher.needs_image:
         return None
-    if icp is None or not icp.contested or icp.T_surfaces is None or settings.motion != "rigid":
+    if icp is None or icp.T_surfaces is None or settings.motion != "rigid":
+        return None
+    if not icp.contested and (refined.slid_m or 0.0) <= tolerance_for(pair.cell):
         return None
     if (matches.margin or 0.0) < SURE or (matches.null_ratio is not None and matches.null_ratio < SURE):
         return None
@@ -150,29 +152,34 @@ def matched_coarser(
         again = _solved(again, pair)
     except RegistrationError:
         return None
+    assert pair.T_target_source is not None
     assert again.T_target_source is not None
+    anew = again.T_target_source
+    beside = _apart_m(pair, anew, icp.T_surfaces) >= _apart_m(pair, anew, pair.T_target_source)
+    if beside and not icp.contested:
+        return None  # along rows both are near, and the nearer counts
     refinement = refine(
         again.source.sample,
         again.target.sample,
-        again.T_target_source,
+        anew,
         settings,
         cell=again.cell,
         agreeing=lambda T: tie_points_agreeing(again, T),
     )
-    if not _same_place(pair, refinement, icp.T_surfaces):
+    met = refinement.icp
+    if met is None or not met.followed or met.contested:
+        return None
+    if _apart_m(pair, refinement.T, icp.T_surfaces) > tolerance_for(pair.cell):
         return None
     why = f"matched and solved again in cells of {cell:g} m: surfaces met better beside the first tie points"
     return again.with_(T_target_source=refinement.T, refinement=replace(refinement, again=why))
 
 
-def _same_place(pair: Pair, after: Refinement, T_surfaces: Floats) -> bool:
-    """Whether tie points and surfaces meet at the coarser cell, and where the surfaces had met before."""
+def _apart_m(pair: Pair, A: Floats, B: Floats) -> float:
+    """Return how far two transforms put the tie points' source ends from each other, the mean in metres."""
     assert pair.tie_points is not None
-    if after.icp is None or not after.icp.followed or after.icp.contested:
-        return False
     places = transforms.apply(transforms.inverse(pair.source.T_level_work), pair.tie_points.source)
-    apart = transforms.apply(after.T, places) - transforms.apply(T_surfaces, places)
-    return bool(np.linalg.norm(apart, axis=1).mean() <= tolerance_for(pair.cell))
+    return float(np.linalg.norm(transforms.apply(A, places) - transforms.apply(B, places), axis=1).mean())
 
 
 def borne_out(before: Refinement, after: Refinement) -> bool:

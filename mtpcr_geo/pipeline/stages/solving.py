@@ -224,19 +224,17 @@ class Refine(Stage):
                 assert again.refinement is not None
                 self.metadata |= {"levelled_again": True, "tilt_deg": tilt, **again.refinement.audit()}
                 return again
-        if options.feedback and options.keep_tie_points:
-            again = matched_coarser(pair, refinement, settings, raster_at)
+        found = pair.with_(T_target_source=refinement.T, refinement=refinement)
+        if options.keep_tie_points:
+            found = _held(found, refinement)
+        if options.feedback and options.keep_tie_points and found.refinement is not None:
+            again = matched_coarser(pair, found.refinement, settings, raster_at)
             if again is not None and again.refinement is not None:
-                again = _held(again, again.refinement)
-                assert again.refinement is not None
                 self.metadata |= {"matched_again_cell_m": again.cell, **again.refinement.audit()}
                 return again
-        pair = pair.with_(T_target_source=refinement.T, refinement=refinement)
-        if options.keep_tie_points:
-            pair = _held(pair, refinement)
-        assert pair.refinement is not None
-        self.metadata |= pair.refinement.audit()
-        return pair
+        assert found.refinement is not None
+        self.metadata |= found.refinement.audit()
+        return found
 
 
 def _held(pair: Pair, refinement: Refinement) -> Pair:
