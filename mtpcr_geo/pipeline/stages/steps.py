@@ -181,7 +181,9 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
     ]
     if options.focus:
         steps.append(Focus(FocusOptions(seed=seed), f"{prefix}focus"))
-    lift = InverseMappingOptions(surface="grey", pixel="ceil", seed=seed)
+    # keypoints lie beside what stands up as often as on it, where a cell may be empty
+    surface = "grey" if trained_on is None else "ground"
+    lift = InverseMappingOptions(surface=surface, pixel="ceil", seed=seed)
     return [
         *steps,
         InverseMapping(lift, f"{prefix}inverse_mapping"),
