@@ -21,7 +21,15 @@ from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Hypothesis, Matches
 from mtpcr_geo.match.base import Advance, Features, ImageMatcher, PixelMatches, View, margin_of, one_to_one
 from mtpcr_geo.match.search import angle_between
-from mtpcr_geo.match.votes import Ballot, Elected, agreeing_keypoints, ballot, elect
+from mtpcr_geo.match.votes import (
+    LEAST_STRENGTH,
+    Ballot,
+    Elected,
+    agreeing_keypoints,
+    ballot,
+    elect,
+    strengths_of,
+)
 from mtpcr_geo.method.solve import ransac_upright
 
 TRIES = 20_000
@@ -206,10 +214,9 @@ class KeypointMatcher:
                 own.target_keypoints,
             )
         )
-        strengths = [float(max(len(one.found) - 2, 0)) for one in elected]
-        null = float(max((len(one.found) - 2 for one in mirrored), default=0))
+        strengths, null = strengths_of(elected), strengths_of(mirrored)
         hypotheses = tuple(_hypothesis(one, value) for one, value in zip(elected, strengths, strict=True))
-        margin = margin_of(strengths, floor=max(null, 1.0))
+        margin = margin_of(strengths, floor=max([*null, LEAST_STRENGTH]))
         report: dict[str, Any] = {
             "method": self.name,
             "cell_m": [source.grid.cell, target.grid.cell],
@@ -221,7 +228,7 @@ class KeypointMatcher:
                 for one in ballots
             ],
             "strengths": strengths,
-            "mirrored_strengths": [float(max(len(one.found) - 2, 0)) for one in mirrored],
+            "mirrored_strengths": null,
             "turn_deg": float(np.degrees(turns[nearest])),
             "agreeing": len(best.found),
             "margin": margin,

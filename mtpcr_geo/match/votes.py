@@ -36,6 +36,8 @@ EXAMINED = 24
 APART_DEG, APART_TOLERANCES = 5.0, 8.0
 """Two poses are distinct where they turn or move the source's keypoints apart by more than this."""
 ROUNDS = 5
+LEAST_STRENGTH = 6.0
+"""Strength that the next pose counts at least: of a handful of agreeing pairs one more or less is chance."""
 
 
 @dataclass(frozen=True)
@@ -145,6 +147,11 @@ def elect(
     ranked = [(transforms.yaw_of(one.T[:3, :3]), one.T[:2, 3]) for one in counted]
     chosen = _distinct(ranked, moves, apart, most)
     return [counted[next(k for k, pose in enumerate(ranked) if pose is one)] for one in chosen]
+
+
+def strengths_of(elected: Sequence[Elected]) -> list[float]:
+    """Return how many pairs agree on each pose, less the two that agree on any."""
+    return [float(max(len(one.found) - 2, 0)) for one in elected]
 
 
 Pose = tuple[float, Floats]
