@@ -131,8 +131,8 @@ def _common_place(one: View, other: View, rng: np.random.Generator) -> Floats:
     height, width = other.filled.shape
     inside = (px >= 0).all(axis=1) & (px < [width, height]).all(axis=1)
     column, row = np.where(inside[:, None], px, 0).T
-    both = inside & other.filled[row, column]
-    return np.asarray(places[int(np.argmax(both))])
+    both = np.asarray(inside & other.filled[row, column])
+    return np.asarray(places[int(both.argmax())])
 
 
 def spoil(sample: Sample, rng: np.random.Generator) -> Sample:
