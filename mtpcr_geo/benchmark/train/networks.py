@@ -21,19 +21,14 @@ SCALE_PX = 256.0
 """Pixels that the matcher takes for one unit of length."""
 
 
-def _block(inside: int, outside: int, stride: int = 1, dilation: int = 1) -> Any:
+def _block(inside: int, outside: int, stride: int = 1) -> Any:
     return nn.Sequential(
-        nn.Conv2d(inside, outside, 3, stride, dilation, dilation, bias=False),
-        nn.BatchNorm2d(outside),
-        nn.ReLU(inplace=True),
+        nn.Conv2d(inside, outside, 3, stride, 1, bias=False), nn.BatchNorm2d(outside), nn.ReLU(inplace=True)
     )
 
 
 class BevPoint(nn.Module):
     """Keypoints and descriptors of an image: a shared trunk to an eighth of the resolution, and two heads.
-
-    The last convolutions are dilated, so that a descriptor sees 109 pixels about its place: one corner of a
-    roof is like another, and what stands round it is not.
 
     Args:
         width: channels of the trunk at its end.
@@ -50,10 +45,10 @@ class BevPoint(nn.Module):
             _block(64, 64),
             _block(64, width, 2),
             _block(width, width),
-            _block(width, width, dilation=2),
+            _block(width, width),
         )
         self.detector = nn.Sequential(_block(width, width), nn.Conv2d(width, CELL_PX**2 + 1, 1))
-        self.descriptor = nn.Sequential(_block(width, width, dilation=2), nn.Conv2d(width, DESCRIPTOR_DIM, 1))
+        self.descriptor = nn.Sequential(_block(width, width), nn.Conv2d(width, DESCRIPTOR_DIM, 1))
 
     def forward(self, image: Any) -> tuple[Any, Any]:
         """Return (b, 65, h/8, w/8) logits of the cells and (b, d, h/8, w/8) descriptors, not normalised.

@@ -41,10 +41,10 @@ class Recipe:
 
     seed: int = 0
     sites: int = 21
-    draws: int = 6
-    feature_steps: int = 5000
+    draws: int = 4
+    feature_steps: int = 1200
     batch: int = 8
-    size: int = 128
+    size: int = 96
     width: int = 96
     matcher_pairs: int = 600
     matcher_epochs: int = 6
