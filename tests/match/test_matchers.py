@@ -399,9 +399,9 @@ def test_paper_profile_and_its_switches_in_the_pipeline():
     assert published["solve"] == {
         "type": "mtpcr.solve", "tag": "solve", "upright": False, "robust_start": False
     }  # fmt: skip
-    # nor do Eq. 5's corners of cells and heights of cells that may be empty suit them
-    lifted = full["inverse_mapping"]
-    assert (lifted.get("surface", "ground"), lifted.get("pixel", "centre")) == ("ground", "centre")
+    # nor do Eq. 5's corners of cells suit them
+    assert full["inverse_mapping"]["surface"] == "top"
+    assert full["inverse_mapping"].get("pixel", "centre") == "centre"
     assert published["inverse_mapping"]["surface"] == "grey"
     assert published["inverse_mapping"]["pixel"] == "ceil"
     # the weights of the package see what they were trained on, others the paper's image

@@ -181,12 +181,11 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
     ]
     if options.focus:
         steps.append(Focus(FocusOptions(seed=seed), f"{prefix}focus"))
-    # Eq. 5 puts pixels at corners of their cells, which a turn takes up to 1.4 cells apart, and heights where
-    # cells may be empty: keypoints lie beside what stands up as often as on it
+    # Eq. 5 puts pixels at corners of their cells, which a turn takes up to 1.4 cells apart
     lift = (
         InverseMappingOptions(surface="grey", pixel="ceil", seed=seed)
         if trained_on is None
-        else InverseMappingOptions(surface="ground", pixel="centre", seed=seed)
+        else InverseMappingOptions(surface="top", pixel="centre", seed=seed)
     )
     return [
         *steps,
