@@ -411,6 +411,8 @@ def test_paper_profile_and_its_switches_in_the_pipeline():
         assert types(matcher=matcher)["enhance"]["look"] == "paper"
     assert types(enhance=False)["enhance"]["look"] == "grey"
     assert full["refine"]["method"] == "point_to_point"
+    assert full["refine"].get("ground", True)
+    assert published["refine"]["ground"] is False
     bare = types(res=False, focus=False, enhance=False, matcher="rootsift")
     assert bare["bev"] == {"type": "mtpcr.bev", "tag": "bev", "cell": 1.0, "pixel": "ceil"}
     assert bare["enhance"]["look"] == "grey"

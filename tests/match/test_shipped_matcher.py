@@ -74,7 +74,7 @@ def test_two_scans_of_a_town_at_any_yaw(yaw_deg):
     T = transforms.compose(transforms.yaw_matrix(np.radians(yaw_deg)), np.array([12.0, -7.0, 0.0]))
     target = town(rng, 60_000)
     source = transforms.apply(transforms.inverse(T), town(rng, 60_000))
-    bevs = [rasterise(xyz, 0.5) for xyz in (source, target)]
+    bevs = [rasterise(xyz, 0.8) for xyz in (source, target)]
     found = matcher().match(*(View(bev, band_image(bev)) for bev in bevs))
     best = found.hypotheses[0]
     assert abs((best.yaw - np.radians(yaw_deg) + np.pi) % (2 * np.pi) - np.pi) < np.radians(2.0)
@@ -84,7 +84,7 @@ def test_two_scans_of_a_town_at_any_yaw(yaw_deg):
 def test_the_same_matches_each_time():
     from helpers_scene import rasterise, town
 
-    bev = rasterise(town(np.random.default_rng(7), 30_000), 0.8)
+    bev = rasterise(town(np.random.default_rng(7), 30_000), 1.2)
     view = View(bev, band_image(bev))
     one, other = (matcher().match(view, view) for _ in range(2))
     assert np.array_equal(one.source_px, other.source_px)

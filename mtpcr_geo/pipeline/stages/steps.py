@@ -168,9 +168,10 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
         if trained_on is None
         else SolveOptions(tries=MANY_TRIES, seed=seed)
     )
+    # matches of few keypoints leave height and tilt too rough for point-to-point ICP alone
     refine = RefineOptions(
         method="point_to_point",
-        ground=False,
+        ground=trained_on is not None,
         max_correspondence_distance=[3.0, 1.5, 0.75],
         keep_tie_points=0,
     )
