@@ -222,11 +222,12 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.match neg_log10_p``: significance of that support
 - ``mtpcr.match patches``: patches in the overlap
 - ``mtpcr.match scores``: scores of the hypotheses at the finest cells
-- ``mtpcr.match strengths``: their strengths: score times support, times how well the ground agrees
+- ``mtpcr.match strengths``: their strengths: score times support, times how well the ground agrees; from
+  keypoints that vote, pairs that agree on each pose, less the two that always do
 - ``mtpcr.match ground_spread_m``: robust spread of the differences between both grounds' heights under each
   of them; null where too little ground is compared
 - ``mtpcr.match mirrored_strengths``: score times support of the hypotheses of the mirrored source; null where
-  it was not searched
+  it was not searched; from keypoints that vote, pairs that agree on each, less two
 - ``mtpcr.match self_likeness``: correlation of the scene under the best hypothesis with itself, moved: a
   scene that repeats itself has 0.4 and more
 - ``mtpcr.match null_ratio``: score times support of the best hypothesis over the best of these
@@ -258,10 +259,12 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.match survey.tiles[].modified_ns``: time of its last change, nanoseconds since 1970
 - ``mtpcr.match zoom``: factor by which images were reduced before keypoints were sought
 - ``mtpcr.match turns_deg``: turns of the source that were tried
-- ``mtpcr.match turn_matches``: matches at each of them
-- ``mtpcr.match turn_agreeing``: of these, matches that agree on one pose
+- ``mtpcr.match turn_matches``: matches at each of them; where keypoints vote, their candidates
+- ``mtpcr.match turn_agreeing``: of these, matches that agree on one pose; where keypoints vote, keypoints of
+  which a candidate agrees on the pose elected
 - ``mtpcr.match turn_deg``: the turn that was taken
-- ``mtpcr.match agreeing``: matches that agree at that turn
+- ``mtpcr.match agreeing``: matches that agree at that turn; where keypoints vote, pairs that agree on the
+  pose
 - ``mtpcr.match tolerance_m``: how far agreeing matches may lie from the pose
 - ``mtpcr.match keypoints``: keypoints in source and target
 - ``mtpcr.focus overlap``: share of the source's ground that the target covers, after the first pass

@@ -8,7 +8,7 @@ metres; those of a wrong one do not. Cells may differ in size: both images are b
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -19,8 +19,17 @@ from mtpcr_geo.core.arrays import Floats, Grey
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Hypothesis, Matches
-from mtpcr_geo.match.base import Advance, ImageMatcher, PixelMatches, View, margin_of, one_to_one
+from mtpcr_geo.match.base import Advance, Features, ImageMatcher, PixelMatches, View, margin_of, one_to_one
 from mtpcr_geo.match.search import angle_between
+from mtpcr_geo.match.votes import (
+    LEAST_STRENGTH,
+    Ballot,
+    Elected,
+    agreeing_keypoints,
+    ballot,
+    elect,
+    strengths_of,
+)
 from mtpcr_geo.method.solve import ransac_upright
 
 TRIES = 20_000
@@ -68,6 +77,8 @@ class KeypointMatcher:
         tolerance_m: plan distance within which matches agree, metres; 1.5 of the larger cells if None.
         sweep_keypoints: keypoints that orientations are compared by; the best is matched with all. None for
             all at once.
+        candidates: partners of a keypoint that vote for a pose, see `mtpcr_geo.match.votes`; 0 for poses by
+            consensus of the matches alone. Only for a `FeatureMatcher` with descriptors of unit length.
 
     """
 
@@ -77,6 +88,7 @@ class KeypointMatcher:
     tolerance_m: float | None = None
     magnify_to: int = 0
     sweep_keypoints: int | None = None
+    candidates: int = 0
     needs_image: bool = field(default=True, init=False)
     needs_one_cell: bool = field(default=False, init=False)
 
@@ -103,6 +115,8 @@ class KeypointMatcher:
         tolerance = self.tolerance_m or AGREE_CELLS * max(source.grid.cell, target.grid.cell)
         image = magnified(source.image, zoom)
         turns = self._sweep(yaw)
+        if self.candidates:
+            return self._by_votes(source, target, image, prepared, turns, zoom, tolerance, advance)
         few = self.sweep_keypoints if len(turns) > 1 else None
         tried, turned = [], []
         for turn in turns:
@@ -118,12 +132,7 @@ class KeypointMatcher:
             best = _judge(best.turn, found, source.grid, target.grid, tolerance, seed)
         if not len(best.found):
             seen = max(len(o.found.source_keypoints) for o in tried), len(best.found.target_keypoints)
-            raise RegistrationError(
-                f"{self.name} finds no match between the images ({seen[0]} keypoints in the source's, "
-                f"{seen[1]} in the target's, of {source.image.size:,} and {target.image.size:,} pixels); "
-                "they may be blank, too small, or of different places: try another cell (option cell), or "
-                "the matcher correlation"
-            )
+            raise RegistrationError(self._nothing(seen, source.image.size))
         hypotheses = _hypotheses(tried)
         # two matches agree on any pose, so that one more counts as the least of a next pose
         margin = margin_of([one.score for one in hypotheses], floor=1.0)
@@ -151,6 +160,104 @@ class KeypointMatcher:
             target_keypoints=best.found.target_keypoints,
         )
 
+    def _by_votes(
+        self,
+        source: View,
+        target: View,
+        image: Grey,
+        prepared: Any,
+        turns: list[float],
+        zoom: float,
+        tolerance: float,
+        advance: Advance,
+    ) -> Matches:
+        """Elect a pose by the candidates of all orientations.
+
+        The matches handed on are the pairs that agree on it, and all that the image matcher finds in the
+        nearest orientation, agreeing or not. The margin is over the next distinct pose and over the best of
+        the mirrored source, which looks alike and has no right pose.
+        """
+        target_px = _shrunk(prepared[0].px, zoom)
+        ballots, turned = [], []
+        for turn in turns:
+            one = _Turned.of(image, source.empty, turn, self.images)
+            ballots.append(self._ballot(one, prepared[0], zoom, turn, source.grid))
+            turned.append(one)
+            advance(1)
+        elected = elect(ballots, target_px, target.grid, tolerance)
+        keypoints = max(len(one.source) for one in ballots), len(target_px)
+        if not elected or not len(elected[0].found):
+            raise RegistrationError(self._nothing(keypoints, image.size))
+        flipped = np.ascontiguousarray(image[:, ::-1])
+        mirrored = elect(
+            [
+                self._ballot(
+                    _Turned.of(flipped, source.empty, turn, self.images), prepared[0], zoom, turn, source.grid
+                )
+                for turn in turns
+            ],
+            target_px,
+            target.grid,
+            tolerance,
+        )
+        best = elected[0]
+        yaw = transforms.yaw_of(best.T[:3, :3])
+        nearest = min(range(len(turns)), key=lambda k: angle_between(turns[k], yaw))
+        own = turned[nearest].match(self.images, prepared, zoom)
+        found = one_to_one(
+            PixelMatches(
+                np.concatenate([best.found.source_px, own.source_px]),
+                np.concatenate([best.found.target_px, own.target_px]),
+                # what agrees with the pose goes before what does not
+                np.concatenate([0.5 + 0.5 * best.found.score, 0.5 * own.score]),
+                own.source_keypoints,
+                own.target_keypoints,
+            )
+        )
+        strengths, null = strengths_of(elected), strengths_of(mirrored)
+        hypotheses = tuple(_hypothesis(one, value) for one, value in zip(elected, strengths, strict=True))
+        margin = margin_of(strengths, floor=max([*null, LEAST_STRENGTH]))
+        report: dict[str, Any] = {
+            "method": self.name,
+            "cell_m": [source.grid.cell, target.grid.cell],
+            "zoom": zoom,
+            "turns_deg": [round(float(np.degrees(turn)), 1) for turn in turns],
+            "turn_matches": [one.partner.size for one in ballots],
+            "turn_agreeing": [
+                agreeing_keypoints(one, best.T, target.grid.to_metres(target_px), tolerance)
+                for one in ballots
+            ],
+            "strengths": strengths,
+            "mirrored_strengths": null,
+            "turn_deg": float(np.degrees(turns[nearest])),
+            "agreeing": len(best.found),
+            "margin": margin,
+            "tolerance_m": tolerance,
+            "keypoints": list(keypoints),
+        }
+        return Matches(
+            found.source_px,
+            found.target_px,
+            found.score,
+            hypotheses,
+            margin=margin,
+            report=report,
+            source_keypoints=found.source_keypoints,
+            target_keypoints=found.target_keypoints,
+        )
+
+    def _ballot(self, turned: _Turned, target: Features, zoom: float, turn: float, grid: Grid) -> Ballot:
+        features = cast(Features, turned.prepared[0])
+        px = _shrunk(_affine(turned.back, features.px), zoom)
+        return ballot(turn, features, px, target, grid, self.candidates)
+
+    def _nothing(self, keypoints: tuple[int, int], pixels: int) -> str:
+        return (
+            f"{self.name} finds no match between the images ({keypoints[0]} keypoints in the source's, "
+            f"{keypoints[1]} in the target's, of {pixels:,} pixels in the source's); they may be blank, too "
+            "small, or of different places: try another cell (option cell), or the matcher correlation"
+        )
+
     def _sweep(self, yaw: float | None) -> list[float]:
         if self.images.any_yaw:
             return [0.0]
@@ -174,19 +281,20 @@ class _Turned:
     def match(self, images: ImageMatcher, target: Any, zoom: float, most: int | None = None) -> PixelMatches:
         """Match to a prepared target, in pixels of the images before magnifying and turning."""
         found = images.match(self.prepared, target, most)
-
-        def shrunk(px: Floats) -> Floats:
-            return np.asarray((px + 0.5) / zoom - 0.5)
-
         return one_to_one(
             PixelMatches(
-                shrunk(_affine(self.back, found.source_px)),
-                shrunk(found.target_px),
+                _shrunk(_affine(self.back, found.source_px), zoom),
+                _shrunk(found.target_px, zoom),
                 np.clip(found.score, 0.0, 1.0),
-                shrunk(_affine(self.back, found.source_keypoints)),
-                shrunk(found.target_keypoints),
+                _shrunk(_affine(self.back, found.source_keypoints), zoom),
+                _shrunk(found.target_keypoints, zoom),
             )
         )
+
+
+def _shrunk(px: Floats, zoom: float) -> Floats:
+    """Take (n, 2) pixels of a magnified image back to those of the image."""
+    return np.asarray((px + 0.5) / zoom - 0.5)
 
 
 def magnified(image: Grey, zoom: float) -> Grey:
@@ -246,6 +354,13 @@ def _judge(
     left = ~agreeing
     runner_up, also = ransac_upright(s[left], t[left], tolerance, seed, TRIES)
     return Orientation(turn, found, T, agreeing, runner_up, max(int(also.sum()) - 2, 0))
+
+
+def _hypothesis(elected: Elected, strength: float) -> Hypothesis:
+    T = elected.T
+    return Hypothesis(
+        transforms.yaw_of(T[:3, :3]), (float(T[0, 3]), float(T[1, 3])), strength, strength=strength
+    )
 
 
 def _hypotheses(tried: list[Orientation]) -> tuple[Hypothesis, ...]:

@@ -112,6 +112,7 @@ def make_matcher(name: str, correlation: CorrelationSettings, keypoints: Keypoin
         **shared,
         magnify_to=model.extractor.magnify_to if model.extractor else 0,
         sweep_keypoints=model.matcher.sweep_keypoints if model.matcher else None,
+        candidates=model.extractor.candidates if model.extractor else 0,
     )
 
 

@@ -399,6 +399,11 @@ def test_paper_profile_and_its_switches_in_the_pipeline():
     assert published["solve"] == {
         "type": "mtpcr.solve", "tag": "solve", "upright": False, "robust_start": False
     }  # fmt: skip
+    # nor do Eq. 5's corners of cells suit them
+    assert full["inverse_mapping"]["surface"] == "top"
+    assert full["inverse_mapping"].get("pixel", "centre") == "centre"
+    assert published["inverse_mapping"]["surface"] == "grey"
+    assert published["inverse_mapping"]["pixel"] == "ceil"
     # the weights of the package see what they were trained on, others the paper's image
     assert full["enhance"].get("look", "band_pass") == "band_pass"
     assert full["match"]["method"] == "bev"
@@ -406,6 +411,8 @@ def test_paper_profile_and_its_switches_in_the_pipeline():
         assert types(matcher=matcher)["enhance"]["look"] == "paper"
     assert types(enhance=False)["enhance"]["look"] == "grey"
     assert full["refine"]["method"] == "point_to_point"
+    assert full["refine"].get("ground", True)
+    assert published["refine"]["ground"] is False
     bare = types(res=False, focus=False, enhance=False, matcher="rootsift")
     assert bare["bev"] == {"type": "mtpcr.bev", "tag": "bev", "cell": 1.0, "pixel": "ceil"}
     assert bare["enhance"]["look"] == "grey"

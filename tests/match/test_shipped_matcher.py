@@ -74,7 +74,7 @@ def test_two_scans_of_a_town_at_any_yaw(yaw_deg):
     T = transforms.compose(transforms.yaw_matrix(np.radians(yaw_deg)), np.array([12.0, -7.0, 0.0]))
     target = town(rng, 60_000)
     source = transforms.apply(transforms.inverse(T), town(rng, 60_000))
-    bevs = [rasterise(xyz, 0.5) for xyz in (source, target)]
+    bevs = [rasterise(xyz, 0.8) for xyz in (source, target)]
     found = matcher().match(*(View(bev, band_image(bev)) for bev in bevs))
     best = found.hypotheses[0]
     assert abs((best.yaw - np.radians(yaw_deg) + np.pi) % (2 * np.pi) - np.pi) < np.radians(2.0)
@@ -84,7 +84,7 @@ def test_two_scans_of_a_town_at_any_yaw(yaw_deg):
 def test_the_same_matches_each_time():
     from helpers_scene import rasterise, town
 
-    bev = rasterise(town(np.random.default_rng(7), 30_000), 0.8)
+    bev = rasterise(town(np.random.default_rng(7), 30_000), 1.2)
     view = View(bev, band_image(bev))
     one, other = (matcher().match(view, view) for _ in range(2))
     assert np.array_equal(one.source_px, other.source_px)
@@ -103,3 +103,35 @@ def test_paper_profile_needs_no_option_and_no_file(town_files, tmp_path):
     assert result.T_target_source is not None
     off = transforms.apply(result.T_target_source, ORIGIN[None]) - transforms.apply(true, ORIGIN[None])
     assert np.linalg.norm(off[0, :2]) < 2.0
+
+
+@pytest.mark.slow
+def test_paper_profile_is_right_on_the_demonstration(tmp_path):
+    from mtpcr_geo.benchmark.metrics import rotation_error_deg
+
+    clouds = Path(str(files("mtpcr_geo.cli").joinpath("demo_clouds")))
+    truth = json.loads((clouds / "truth.json").read_text(encoding="utf-8"))["ground_truth"]
+    true = np.array(truth["T_target_from_source"])
+    result = register(
+        clouds / "ground.laz", clouds / "aerial.laz", tmp_path / "out", profile="paper", source_crs="local"
+    )
+    assert result.T_target_source is not None
+    assert rotation_error_deg(result.T_target_source, true) < 5.0
+    # the middle of the ground cloud
+    middle = np.array([[-47.0, 171.0, 5.0]])
+    off = transforms.apply(result.T_target_source, middle) - transforms.apply(true, middle)
+    assert np.linalg.norm(off[0, :2]) < 2.0
+    match = next(record for record in result.report if record.type == "mtpcr.match").metadata
+    assert match["strengths"][0] > 1.3 * max(match["mirrored_strengths"])
+
+
+def test_blank_images_are_refused():
+    from helpers_scene import rasterise
+
+    from mtpcr_geo.core.errors import RegistrationError
+
+    rng = np.random.default_rng(3)
+    flat = rasterise(np.column_stack([rng.uniform(0.0, 60.0, (4000, 2)), np.zeros(4000)]), 1.0)
+    view = View(flat, np.full(flat.grid.shape, 127, np.uint8))
+    with pytest.raises(RegistrationError, match="finds no match between the images"):
+        matcher().match(view, view)

@@ -53,6 +53,13 @@ class ExtractorFile(_Part):
     magnify_to: int = Field(
         0, ge=0, description="images are magnified twice where they then stay within this edge; 0 for never"
     )
+    candidates: int = Field(
+        0,
+        ge=0,
+        le=100,
+        description="partners of a keypoint, by descriptors of unit length, that vote for a pose; 0 for "
+        "poses by consensus of the matches alone",
+    )
     channels: Literal[1, 3] = Field(1, description="grey, or grey three times over")
     mean: float = Field(0.0, description="taken from grey / 255 before the graph sees it")
     std: float = Field(1.0, gt=0, description="by which the rest is divided")

@@ -168,9 +168,10 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
         if trained_on is None
         else SolveOptions(tries=MANY_TRIES, seed=seed)
     )
+    # matches of few keypoints leave height and tilt too rough for point-to-point ICP alone
     refine = RefineOptions(
         method="point_to_point",
-        ground=False,
+        ground=trained_on is not None,
         max_correspondence_distance=[3.0, 1.5, 0.75],
         keep_tie_points=0,
     )
@@ -181,7 +182,12 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
     ]
     if options.focus:
         steps.append(Focus(FocusOptions(seed=seed), f"{prefix}focus"))
-    lift = InverseMappingOptions(surface="grey", pixel="ceil", seed=seed)
+    # Eq. 5 puts pixels at corners of their cells, which a turn takes up to 1.4 cells apart
+    lift = (
+        InverseMappingOptions(surface="grey", pixel="ceil", seed=seed)
+        if trained_on is None
+        else InverseMappingOptions(surface="top", pixel="centre", seed=seed)
+    )
     return [
         *steps,
         InverseMapping(lift, f"{prefix}inverse_mapping"),
