@@ -23,7 +23,7 @@ from mtpcr_geo.match.base import Features, PixelMatches, one_to_one
 from mtpcr_geo.match.search import angle_between
 from mtpcr_geo.method.solve import fit_upright
 
-BEARS_DEG = 26.0
+TOLERATED_DEG = 26.0
 """Rotation that descriptors tolerate: keypoints of an orientation vote for yaws no farther from it."""
 YAW_STEPS_DEG = (0.5, 3.0)
 """Finest and coarsest step between yaws; between them it moves keypoints by the tolerance."""
@@ -191,7 +191,7 @@ def _peaks(
         R = transforms.yaw_matrix(float(yaw))[:2, :2]
         votes = np.zeros(bins * bins)
         for one, offset in zip(ballots, offsets, strict=True):
-            if angle_between(one.turn, float(yaw)) > np.radians(BEARS_DEG) or not one.partner.size:
+            if angle_between(one.turn, float(yaw)) > np.radians(TOLERATED_DEG) or not one.partner.size:
                 continue
             shift = (target - centre)[one.partner] - (offset @ R.T)[:, None]
             column, row = np.floor((shift + radius) / edge).astype(np.int64).reshape(-1, 2).T
@@ -216,7 +216,7 @@ def _count(
 ) -> Elected:
     """Fit a pose to the candidates near it, and count those that agree one to one."""
     yaw, shift = pose
-    bearing = [one for one in ballots if angle_between(one.turn, yaw) <= np.radians(BEARS_DEG)]
+    bearing = [one for one in ballots if angle_between(one.turn, yaw) <= np.radians(TOLERATED_DEG)]
     k = [one.partner.shape[1] for one in bearing]
     s = np.concatenate([np.repeat(one.source, n, axis=0) for one, n in zip(bearing, k, strict=True)])
     s_px = np.concatenate([np.repeat(one.source_px, n, axis=0) for one, n in zip(bearing, k, strict=True)])

@@ -127,7 +127,7 @@ def matched_coarser(
 
     Args:
         pair: solved, with matches and rasters.
-        refined: what the refinement came to; if it was held to the tie points, ICP is heard again.
+        refined: what the refinement came to; also one that was held to the tie points.
         settings: of the refinement.
         rasterise: makes the raster of a side at a cell, metres.
 
