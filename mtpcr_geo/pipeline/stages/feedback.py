@@ -152,6 +152,9 @@ def matched_coarser(
         again = _solved(again, pair)
     except RegistrationError:
         return None
+    assert again.matches is not None
+    if cell * (again.matches.strength or 0.0) <= pair.cell * (matches.strength or 0.0):
+        return None  # in metres the strength is the same at any cell that is filled well
     assert pair.T_target_source is not None
     assert again.T_target_source is not None
     anew = again.T_target_source
