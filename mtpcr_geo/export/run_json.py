@@ -261,7 +261,7 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.match turns_deg``: turns of the source that were tried
 - ``mtpcr.match turn_matches``: matches at each of them; where keypoints vote, their candidates
 - ``mtpcr.match turn_agreeing``: of these, matches that agree on one pose; where keypoints vote, keypoints of
-  which a candidate agrees on the pose elected
+  which a candidate agrees on the pose of most votes
 - ``mtpcr.match turn_deg``: the turn that was taken
 - ``mtpcr.match agreeing``: matches that agree at that turn; where keypoints vote, pairs that agree on the
   pose

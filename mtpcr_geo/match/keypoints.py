@@ -23,11 +23,11 @@ from mtpcr_geo.match.base import Advance, Features, ImageMatcher, PixelMatches, 
 from mtpcr_geo.match.search import angle_between
 from mtpcr_geo.match.votes import (
     LEAST_STRENGTH,
-    Ballot,
-    Elected,
+    Candidates,
+    VotedPose,
     agreeing_keypoints,
-    ballot,
-    elect,
+    candidates_of,
+    poses_by_votes,
     strengths_of,
 )
 from mtpcr_geo.method.solve import ransac_upright
@@ -171,27 +171,27 @@ class KeypointMatcher:
         tolerance: float,
         advance: Advance,
     ) -> Matches:
-        """Elect a pose by the candidates of all orientations.
+        """Find a pose by the candidates of all orientations.
 
         The matches handed on are the pairs that agree on it, and all that the image matcher finds in the
         nearest orientation, agreeing or not. The margin is over the next distinct pose and over the best of
         the mirrored source, which looks alike and has no right pose.
         """
         target_px = _shrunk(prepared[0].px, zoom)
-        ballots, turned = [], []
+        orientations, turned = [], []
         for turn in turns:
             one = _Turned.of(image, source.empty, turn, self.images)
-            ballots.append(self._ballot(one, prepared[0], zoom, turn, source.grid))
+            orientations.append(self._candidates_of(one, prepared[0], zoom, turn, source.grid))
             turned.append(one)
             advance(1)
-        elected = elect(ballots, target_px, target.grid, tolerance)
-        keypoints = max(len(one.source) for one in ballots), len(target_px)
-        if not elected or not len(elected[0].found):
+        voted = poses_by_votes(orientations, target_px, target.grid, tolerance)
+        keypoints = max(len(one.source) for one in orientations), len(target_px)
+        if not voted or not len(voted[0].found):
             raise RegistrationError(self._nothing(keypoints, image.size))
         flipped = np.ascontiguousarray(image[:, ::-1])
-        mirrored = elect(
+        mirrored = poses_by_votes(
             [
-                self._ballot(
+                self._candidates_of(
                     _Turned.of(flipped, source.empty, turn, self.images), prepared[0], zoom, turn, source.grid
                 )
                 for turn in turns
@@ -200,7 +200,7 @@ class KeypointMatcher:
             target.grid,
             tolerance,
         )
-        best = elected[0]
+        best = voted[0]
         yaw = transforms.yaw_of(best.T[:3, :3])
         nearest = min(range(len(turns)), key=lambda k: angle_between(turns[k], yaw))
         own = turned[nearest].match(self.images, prepared, zoom)
@@ -214,18 +214,18 @@ class KeypointMatcher:
                 own.target_keypoints,
             )
         )
-        strengths, null = strengths_of(elected), strengths_of(mirrored)
-        hypotheses = tuple(_hypothesis(one, value) for one, value in zip(elected, strengths, strict=True))
+        strengths, null = strengths_of(voted), strengths_of(mirrored)
+        hypotheses = tuple(_hypothesis(one, value) for one, value in zip(voted, strengths, strict=True))
         margin = margin_of(strengths, floor=max([*null, LEAST_STRENGTH]))
         report: dict[str, Any] = {
             "method": self.name,
             "cell_m": [source.grid.cell, target.grid.cell],
             "zoom": zoom,
             "turns_deg": [round(float(np.degrees(turn)), 1) for turn in turns],
-            "turn_matches": [one.partner.size for one in ballots],
+            "turn_matches": [one.partner.size for one in orientations],
             "turn_agreeing": [
                 agreeing_keypoints(one, best.T, target.grid.to_metres(target_px), tolerance)
-                for one in ballots
+                for one in orientations
             ],
             "strengths": strengths,
             "mirrored_strengths": null,
@@ -246,10 +246,12 @@ class KeypointMatcher:
             target_keypoints=found.target_keypoints,
         )
 
-    def _ballot(self, turned: _Turned, target: Features, zoom: float, turn: float, grid: Grid) -> Ballot:
+    def _candidates_of(
+        self, turned: _Turned, target: Features, zoom: float, turn: float, grid: Grid
+    ) -> Candidates:
         features = cast(Features, turned.prepared[0])
         px = _shrunk(_affine(turned.back, features.px), zoom)
-        return ballot(turn, features, px, target, grid, self.candidates)
+        return candidates_of(turn, features, px, target, grid, self.candidates)
 
     def _nothing(self, keypoints: tuple[int, int], pixels: int) -> str:
         return (
@@ -356,8 +358,8 @@ def _judge(
     return Orientation(turn, found, T, agreeing, runner_up, max(int(also.sum()) - 2, 0))
 
 
-def _hypothesis(elected: Elected, strength: float) -> Hypothesis:
-    T = elected.T
+def _hypothesis(voted: VotedPose, strength: float) -> Hypothesis:
+    T = voted.T
     return Hypothesis(
         transforms.yaw_of(T[:3, :3]), (float(T[0, 3]), float(T[1, 3])), strength, strength=strength
     )

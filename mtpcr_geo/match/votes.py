@@ -9,7 +9,7 @@ mutual nearest neighbours alone loses such poses.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -20,7 +20,8 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.match.base import Features, PixelMatches, one_to_one
-from mtpcr_geo.match.search import angle_between
+from mtpcr_geo.match.pose import Pose
+from mtpcr_geo.match.search import angle_between, distinct
 from mtpcr_geo.method.solve import fit_upright
 
 TOLERATED_DEG = 26.0
@@ -41,7 +42,7 @@ LEAST_STRENGTH = 6.0
 
 
 @dataclass(frozen=True)
-class Ballot:
+class Candidates:
     """The candidates of one orientation of the source.
 
     Attributes:
@@ -61,7 +62,7 @@ class Ballot:
 
 
 @dataclass(frozen=True)
-class Elected:
+class VotedPose:
     """A pose and the candidates that agree on it.
 
     Attributes:
@@ -74,7 +75,7 @@ class Elected:
     found: PixelMatches
 
 
-def agreeing_keypoints(one: Ballot, T: Floats, target: Floats, tolerance: float) -> int:
+def agreeing_keypoints(one: Candidates, T: Floats, target: Floats, tolerance: float) -> int:
     """Count the keypoints of an orientation of which a candidate agrees with a pose.
 
     Args:
@@ -89,9 +90,9 @@ def agreeing_keypoints(one: Ballot, T: Floats, target: Floats, tolerance: float)
     return int((gap < tolerance).any(axis=1).sum())
 
 
-def ballot(
+def candidates_of(
     turn: float, source: Features, source_px: Floats, target: Features, grid: Grid, candidates: int
-) -> Ballot:
+) -> Candidates:
     """Find the candidates of the keypoints of one orientation.
 
     Args:
@@ -106,21 +107,21 @@ def ballot(
     k = min(candidates, len(target))
     if not len(source) or not k:
         none = np.empty((len(source), 0))
-        return Ballot(turn, source_px, grid.to_metres(source_px), none.astype(np.int64), none)
+        return Candidates(turn, source_px, grid.to_metres(source_px), none.astype(np.int64), none)
     likeness = np.asarray(source.descriptors @ target.descriptors.T, np.float64)
     partner = np.argsort(-likeness, axis=1, kind="stable")[:, :k]
-    return Ballot(
+    return Candidates(
         turn, source_px, grid.to_metres(source_px), partner, np.take_along_axis(likeness, partner, axis=1)
     )
 
 
-def elect(
-    ballots: Sequence[Ballot], target_px: Floats, grid: Grid, tolerance: float, most: int = 8
-) -> list[Elected]:
+def poses_by_votes(
+    orientations: Sequence[Candidates], target_px: Floats, grid: Grid, tolerance: float, most: int = 8
+) -> list[VotedPose]:
     """Find the poses on which most candidates agree.
 
     Args:
-        ballots: of all orientations.
+        orientations: the candidates of each orientation tried.
         target_px: (m, 2) keypoints of the target, pixels.
         grid: of the target.
         tolerance: plan distance within which candidates agree, metres.
@@ -131,53 +132,31 @@ def elect(
 
     """
     target = grid.to_metres(target_px)
-    places = np.concatenate([one.source for one in ballots])
+    places = np.concatenate([one.source for one in orientations])
     if not len(places) or not len(target):
         return []
     middle = places.mean(axis=0)
-    poses = sorted(_peaks(ballots, target, middle, tolerance), key=lambda pose: -pose[0])
-
-    def moves(yaw: float, shift: Floats) -> Floats:
-        return np.asarray(transforms.yaw_matrix(yaw)[:2, :2] @ middle + shift)
-
-    apart = APART_TOLERANCES * tolerance
-    kept = _distinct([(yaw, shift) for _, yaw, shift in poses], moves, apart, EXAMINED)
-    counted = [_count(ballots, target_px, target, grid, pose, tolerance) for pose in kept]
+    peaks = sorted(_peaks(orientations, target, middle, tolerance), key=lambda pose: -pose.score)
+    turned, apart = np.radians(APART_DEG), APART_TOLERANCES * tolerance
+    counted = [
+        _count(orientations, target_px, target, grid, pose, middle, tolerance)
+        for pose in distinct(peaks, EXAMINED, turned, apart)
+    ]
     counted.sort(key=lambda one: -len(one.found))
-    ranked = [(transforms.yaw_of(one.T[:3, :3]), one.T[:2, 3]) for one in counted]
-    chosen = _distinct(ranked, moves, apart, most)
-    return [counted[next(k for k, pose in enumerate(ranked) if pose is one)] for one in chosen]
+    by_pose = {_about(middle, one): one for one in counted}
+    return [by_pose[pose] for pose in distinct(by_pose, most, turned, apart)]
 
 
-def strengths_of(elected: Sequence[Elected]) -> list[float]:
+def strengths_of(voted: Sequence[VotedPose]) -> list[float]:
     """Return how many pairs agree on each pose, less the two that agree on any."""
-    return [float(max(len(one.found) - 2, 0)) for one in elected]
-
-
-Pose = tuple[float, Floats]
-
-
-def _distinct(
-    poses: Sequence[Pose], moves: Callable[[float, Floats], Floats], apart: float, most: int
-) -> list[Pose]:
-    kept: list[Pose] = []
-    for pose in poses:
-        if len(kept) == most:
-            break
-        if all(
-            angle_between(pose[0], other[0]) > np.radians(APART_DEG)
-            or np.linalg.norm(moves(*pose) - moves(*other)) > apart
-            for other in kept
-        ):
-            kept.append(pose)
-    return kept
+    return [float(max(len(one.found) - 2, 0)) for one in voted]
 
 
 def _peaks(
-    ballots: Sequence[Ballot], target: Floats, middle: Floats, tolerance: float
-) -> Iterator[tuple[float, float, Floats]]:
-    """Yield the votes, yaw and shift of the strongest shifts of every yaw."""
-    offsets = [one.source - middle for one in ballots]
+    orientations: Sequence[Candidates], target: Floats, middle: Floats, tolerance: float
+) -> Iterator[Pose]:
+    """Yield the strongest shifts of every yaw as poses of the middle, scored by their votes."""
+    offsets = [one.source - middle for one in orientations]
     far = np.concatenate([np.hypot(*one.T) for one in offsets])
     finest, coarsest = YAW_STEPS_DEG
     step = np.clip(np.degrees(tolerance / max(float(np.quantile(far, 0.9)), 1e-6)), finest, coarsest)
@@ -190,7 +169,7 @@ def _peaks(
     for yaw in 2 * np.pi * np.arange(count) / count:
         R = transforms.yaw_matrix(float(yaw))[:2, :2]
         votes = np.zeros(bins * bins)
-        for one, offset in zip(ballots, offsets, strict=True):
+        for one, offset in zip(orientations, offsets, strict=True):
             if angle_between(one.turn, float(yaw)) > np.radians(TOLERATED_DEG) or not one.partner.size:
                 continue
             shift = (target - centre)[one.partner] - (offset @ R.T)[:, None]
@@ -207,21 +186,34 @@ def _peaks(
             row, column = divmod(int(summed.argmax()), bins)
             # the window of a bin ends with it
             place = np.array([column, row]) * edge - radius + centre
-            yield float(summed[row, column]), float(yaw), place - R @ middle
+            yield Pose(float(yaw), float(place[0]), float(place[1]), float(summed[row, column]), 0)
             summed[max(row - around, 0) : row + around + 1, max(column - around, 0) : column + around + 1] = 0
 
 
+def _about(middle: Floats, one: VotedPose) -> Pose:
+    """Return a pose by where it puts the middle of the source's keypoints."""
+    place = one.T[:2, :2] @ middle + one.T[:2, 3]
+    return Pose(transforms.yaw_of(one.T[:3, :3]), float(place[0]), float(place[1]), float(len(one.found)), 0)
+
+
 def _count(
-    ballots: Sequence[Ballot], target_px: Floats, target: Floats, grid: Grid, pose: Pose, tolerance: float
-) -> Elected:
+    orientations: Sequence[Candidates],
+    target_px: Floats,
+    target: Floats,
+    grid: Grid,
+    pose: Pose,
+    middle: Floats,
+    tolerance: float,
+) -> VotedPose:
     """Fit a pose to the candidates near it, and count those that agree one to one."""
-    yaw, shift = pose
-    bearing = [one for one in ballots if angle_between(one.turn, yaw) <= np.radians(TOLERATED_DEG)]
-    k = [one.partner.shape[1] for one in bearing]
-    s = np.concatenate([np.repeat(one.source, n, axis=0) for one, n in zip(bearing, k, strict=True)])
-    s_px = np.concatenate([np.repeat(one.source_px, n, axis=0) for one, n in zip(bearing, k, strict=True)])
-    partner = np.concatenate([one.partner.ravel() for one in bearing])
-    likeness = np.concatenate([one.likeness.ravel() for one in bearing])
+    yaw = pose.yaw
+    shift = np.array([pose.east, pose.north]) - transforms.yaw_matrix(yaw)[:2, :2] @ middle
+    near = [one for one in orientations if angle_between(one.turn, yaw) <= np.radians(TOLERATED_DEG)]
+    k = [one.partner.shape[1] for one in near]
+    s = np.concatenate([np.repeat(one.source, n, axis=0) for one, n in zip(near, k, strict=True)])
+    s_px = np.concatenate([np.repeat(one.source_px, n, axis=0) for one, n in zip(near, k, strict=True)])
+    partner = np.concatenate([one.partner.ravel() for one in near])
+    likeness = np.concatenate([one.likeness.ravel() for one in near])
     t = target[partner]
     T = transforms.compose(transforms.yaw_matrix(yaw), np.append(shift, 0.0))
     reach = 2.0 * tolerance
@@ -236,4 +228,4 @@ def _count(
         reach = tolerance
     agreeing = np.hypot(*(s @ T[:2, :2].T + T[:2, 3] - t).T) < tolerance
     pairs = PixelMatches(s_px[agreeing], target_px[partner[agreeing]], np.clip(likeness[agreeing], 0.0, 1.0))
-    return Elected(T, one_to_one(pairs, tolerance / grid.cell))
+    return VotedPose(T, one_to_one(pairs, tolerance / grid.cell))

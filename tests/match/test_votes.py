@@ -10,7 +10,14 @@ import pytest
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.match.base import Features, margin_of
-from mtpcr_geo.match.votes import LEAST_STRENGTH, Ballot, agreeing_keypoints, ballot, elect, strengths_of
+from mtpcr_geo.match.votes import (
+    LEAST_STRENGTH,
+    Candidates,
+    agreeing_keypoints,
+    candidates_of,
+    poses_by_votes,
+    strengths_of,
+)
 
 CELL = 1.0
 TOLERANCE = 1.5
@@ -43,14 +50,14 @@ def scene(seed: int, yaw: float, shared: int = 60, others: int = 400, noise: flo
     return features(grid().to_pixel(source), own), features(grid().to_pixel(target), other)
 
 
-def ballots(source: Features, target: Features, yaw: float, candidates: int) -> list[Ballot]:
+def orientations(source: Features, target: Features, yaw: float, candidates: int) -> list[Candidates]:
     """Vote in eight orientations, of which the two nearest to the yaw know the descriptors."""
     rng = np.random.default_rng(9)
     made = []
     for turn in 2 * np.pi * np.arange(8) / 8:
         near = abs((turn - yaw + np.pi) % (2 * np.pi) - np.pi) < np.radians(26.0)
         seen = source if near else replace(source, descriptors=unit(rng.normal(size=(len(source), DIM))))
-        made.append(ballot(float(turn), seen, source.px, target, grid(), candidates))
+        made.append(candidates_of(float(turn), seen, source.px, target, grid(), candidates))
     return made
 
 
@@ -58,7 +65,7 @@ def ballots(source: Features, target: Features, yaw: float, candidates: int) -> 
 def test_candidates_carry_a_pose_that_nearest_neighbours_lose(yaw_deg):
     yaw = np.radians(yaw_deg)
     source, target = scene(3, yaw, noise=2.2)
-    best, *others = elect(ballots(source, target, yaw, 10), target.px, grid(), TOLERANCE)
+    best, *others = poses_by_votes(orientations(source, target, yaw, 10), target.px, grid(), TOLERANCE)
     assert transforms.yaw_of(best.T[:3, :3]) == pytest.approx((yaw + np.pi) % (2 * np.pi) - np.pi, abs=0.01)
     assert np.allclose(best.T[:2, 3], SHIFT, atol=0.4)
     assert len(best.found) > 1.5 * len(others[0].found)
@@ -71,8 +78,8 @@ def test_pairs_are_counted_one_to_one():
     yaw = np.radians(22.5)
     source, target = scene(5, yaw, noise=0.3)
     # two orientations see all of it, and every keypoint has several candidates
-    made = ballots(source, target, yaw, 5)
-    best = elect(made, target.px, grid(), TOLERANCE)[0]
+    made = orientations(source, target, yaw, 5)
+    best = poses_by_votes(made, target.px, grid(), TOLERANCE)[0]
     assert 50 <= len(best.found) <= 70
     for px in (best.found.source_px, best.found.target_px):
         assert len(np.unique(px, axis=0)) == len(px)
@@ -84,13 +91,13 @@ def test_pairs_are_counted_one_to_one():
 @pytest.mark.parametrize("seed", range(4))
 def test_nothing_stands_out_where_nothing_is_shared(seed):
     source, target = scene(seed, 1.0, shared=0, others=460)
-    found = elect(ballots(source, target, 1.0, 5), target.px, grid(), TOLERANCE)
+    found = poses_by_votes(orientations(source, target, 1.0, 5), target.px, grid(), TOLERANCE)
     assert margin_of(strengths_of(found), floor=LEAST_STRENGTH) < 1.3
 
 
 def test_poses_are_distinct_and_fall():
     source, target = scene(7, 2.0)
-    found = elect(ballots(source, target, 2.0, 5), target.px, grid(), TOLERANCE)
+    found = poses_by_votes(orientations(source, target, 2.0, 5), target.px, grid(), TOLERANCE)
     counts = [len(one.found) for one in found]
     assert counts == sorted(counts, reverse=True)
     middle = grid().to_metres(source.px).mean(axis=0)
@@ -104,20 +111,30 @@ def test_poses_are_distinct_and_fall():
 
 def test_the_same_each_time():
     source, target = scene(8, 0.7)
-    one, other = (elect(ballots(source, target, 0.7, 5), target.px, grid(), TOLERANCE) for _ in range(2))
+    one, other = (
+        poses_by_votes(orientations(source, target, 0.7, 5), target.px, grid(), TOLERANCE) for _ in range(2)
+    )
     assert all(np.array_equal(a.T, b.T) for a, b in zip(one, other, strict=True))
 
 
 def test_without_keypoints_there_is_no_pose():
     source, target = scene(1, 0.0)
     none = features(np.empty((0, 2)), np.empty((0, DIM)))
-    assert elect([ballot(0.0, none, none.px, target, grid(), 5)], target.px, grid(), TOLERANCE) == []
-    assert elect([ballot(0.0, source, source.px, none, grid(), 5)], none.px, grid(), TOLERANCE) == []
+    assert (
+        poses_by_votes([candidates_of(0.0, none, none.px, target, grid(), 5)], target.px, grid(), TOLERANCE)
+        == []
+    )
+    assert (
+        poses_by_votes([candidates_of(0.0, source, source.px, none, grid(), 5)], none.px, grid(), TOLERANCE)
+        == []
+    )
 
 
 def test_fewer_keypoints_than_candidates():
     source, target = scene(2, 0.0, shared=3, others=0, noise=0.0)
-    best = elect([ballot(0.0, source, source.px, target, grid(), 50)], target.px, grid(), TOLERANCE)[0]
+    best = poses_by_votes(
+        [candidates_of(0.0, source, source.px, target, grid(), 50)], target.px, grid(), TOLERANCE
+    )[0]
     assert len(best.found) == 3
     assert np.allclose(best.T[:2, 3], SHIFT, atol=0.5)
 
@@ -130,6 +147,6 @@ def test_large_sites_take_coarser_bins():
     own, other = rng.normal(size=(2, 500, DIM))
     other[:80] = own[:80] + rng.normal(size=(80, DIM))
     s, t = features(wide.to_pixel(places[0]), own), features(wide.to_pixel(places[1]), other)
-    best = elect([ballot(0.0, s, s.px, t, wide, 5)], t.px, wide, TOLERANCE)[0]
+    best = poses_by_votes([candidates_of(0.0, s, s.px, t, wide, 5)], t.px, wide, TOLERANCE)[0]
     assert np.allclose(best.T[:2, 3], SHIFT, atol=0.5)
     assert len(best.found) > 60

@@ -123,7 +123,7 @@ def matched_coarser(
 
     Either the surfaces are right, which many more points have seen, or they slid along open ground or along
     rows. Tie points found anew, on rasters whose cells hold twice as many points, decide which: only where
-    they agree with the place that the surfaces chose is it taken.
+    they match better and agree with the place that the surfaces chose is it taken.
 
     Args:
         pair: solved, with matches and rasters.
@@ -133,7 +133,7 @@ def matched_coarser(
 
     Returns:
         The pair matched, solved and refined at the coarser cell, or None where nothing contradicts the tie
-        points, the search was not sure of the pose, or the tie points of the coarser cell lead elsewhere.
+        points, the search was not sure of the pose, or the coarser cell matches no better or leads elsewhere.
 
     """
     matches, icp = pair.matches, refined.icp
