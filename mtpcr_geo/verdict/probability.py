@@ -1,8 +1,11 @@
-"""How probable it is that a pose is right: a logistic model of the evidence, fitted to runs of known answer.
+"""How probable it is that a pose is right: a model of the evidence, fitted to runs of known answer.
 
-Each piece of evidence may only speak for a pose: weights are not negative. What the model was fitted to, and
-how it does on sites that it was not fitted to, stands in ``calibration.json`` beside this module;
-``mtpcr-geo benchmark --calibrate`` makes it from the rows of robustness benchmarks.
+A pose is right where the clouds fit under it, and where it is not one that merely looks alike: a symmetrical
+site turned by half a turn fits as well as it does in its place. The probability is the product of both, each
+a logistic model, fitted together. Each piece of evidence may only speak for a pose: weights are not negative.
+What the model was fitted to, and how it does on sites that it was not fitted to, stands in
+``calibration.json`` beside this module; ``mtpcr-geo benchmark --calibrate`` makes it from the rows of
+robustness benchmarks.
 """
 
 from __future__ import annotations
@@ -20,25 +23,33 @@ from mtpcr_geo.core.arrays import Floats
 
 FILE = "calibration.json"
 RATIOS = (0.2, 20.0)
-"""Ratios of strengths beyond which they say no more."""
+"""Ratios of strengths to the next distinct pose's beyond which they say no more."""
 RELIEF_NOISE_M = 0.05
 """Added to spread and relief of the ground: what is below it is noise."""
 GROUND_CLEAR = (-1.0, 2.5)
 GROUND_EXPECTED = 0.7
-MOST_MISSING = 0.5
-"""Share of missing objects beyond which more says no more."""
+MOST_MISSING, MISSING_UNIT = 0.5, 0.1
+"""Share of missing objects beyond which more says no more, and the unit that it counts in."""
+CLEAR_OF_MIRROR = 3.0
+"""Ratio of strengths to the mirrored source's beyond which a site does not fit its own mirror image."""
 TIE_POINTS_PER_PATCH = 4
 """Patches overlap by half, so about four tie points tell what one independent tie would."""
 
-FEATURES = ("margin", "null", "agreement", "ground_shape", "ground_agreement", "refinement", "objects")
-"""The evidence, as numbers that grow with what speaks for a pose:
+FIT = ("margin", "agreement", "ground_shape", "ground_agreement", "refinement")
+"""What says that the clouds fit, as numbers that grow with what speaks for a pose:
 
 - margin: logarithm of the strength over that of the next distinct pose;
-- null: logarithm of the strength over the best of the mirrored source;
 - agreement: logarithm of the significance of the held-out tie points, overlapping ones counted once;
 - ground_shape: logarithm of the ground's relief over the spread of the height differences;
 - ground_agreement: share of the common ground that agrees, over what flat ground of any place reaches;
-- refinement: -1 where surfaces fit better where the tie points do not agree;
+- refinement: -1 where surfaces fit better where the tie points do not agree.
+"""
+
+UNIQUE = ("mirror", "objects")
+"""What says that no other pose looks alike, likewise:
+
+- mirror: logarithm of the strength over the best of the mirrored source, up to where it is clear of it: a
+  scene without a right pose reaches as much, and most sites that fit themselves after half a turn do;
 - objects: minus the share of one cloud's objects at whose place the other sees bare ground.
 """
 
@@ -50,8 +61,8 @@ def features_of(metrics: Mapping[str, Any]) -> Floats | None:
         metrics: as `mtpcr_geo.verdict.decision.assess` gives them.
 
     Returns:
-        (f,) in the order of `FEATURES`; None where the matcher gives no margin, or no mirrored source was
-        searched.
+        (f,) in the order of `FIT`, then `UNIQUE`; None where the matcher gives no margin, or no mirrored
+        source was searched.
 
     """
     margin, null = metrics.get("hypothesis_margin"), metrics.get("null_ratio")
@@ -67,14 +78,33 @@ def features_of(metrics: Mapping[str, Any]) -> Floats | None:
     return np.array(
         [
             np.log(np.clip(margin, *RATIOS)),
-            np.log(np.clip(null, *RATIOS)),
             np.log1p(significance / TIE_POINTS_PER_PATCH),
             shape,
             share if metrics.get("ground_checked") else 0.0,
             -1.0 if metrics.get("refinement_lost") else 0.0,
-            -min(metrics.get("objects_missing") or 0.0, MOST_MISSING),
+            np.log(np.clip(null, RATIOS[0], CLEAR_OF_MIRROR)),
+            -min(metrics.get("objects_missing") or 0.0, MOST_MISSING) / MISSING_UNIT,
         ]
     )
+
+
+@dataclass(frozen=True)
+class Logistic:
+    """A logistic model.
+
+    Attributes:
+        intercept: log odds where nothing is known.
+        weights: (f,) by which the features add to the log odds.
+
+    """
+
+    intercept: float
+    weights: tuple[float, ...]
+
+    def probability(self, features: Floats) -> Floats:
+        """Return the probability, (...,), of (..., f) features."""
+        odds = self.intercept + np.asarray(features) @ np.array(self.weights)
+        return np.asarray(1.0 / (1.0 + np.exp(-odds)))
 
 
 @dataclass(frozen=True)
@@ -82,28 +112,44 @@ class Calibration:
     """A fitted model.
 
     Attributes:
-        intercept: log odds of a pose of which nothing is known.
-        weights: (f,) by which the features of `FEATURES` add to the log odds.
+        fit: that the clouds fit, of the features of `FIT`.
+        unique: that no other pose looks alike, of those of `UNIQUE`.
         about: what it was fitted to, when, and how it does on other sites.
 
     """
 
-    intercept: float
-    weights: tuple[float, ...]
+    fit: Logistic
+    unique: Logistic
     about: Mapping[str, Any]
 
     def probability(self, features: Floats) -> Floats:
-        """Return the probability of being right, (...,), of (..., f) features."""
-        odds = self.intercept + np.asarray(features) @ np.array(self.weights)
-        return np.asarray(1.0 / (1.0 + np.exp(-odds)))
+        """Return the probability of being right, (...,), of (..., f) features, see `features_of`."""
+        features = np.asarray(features)
+        split = len(self.fit.weights)
+        fits, unique = features[..., :split], features[..., split:]
+        return self.fit.probability(fits) * self.unique.probability(unique)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what `FILE` holds."""
+        models = {"fit": (FIT, self.fit), "unique": (UNIQUE, self.unique)}
+        return {"about": dict(self.about)} | {
+            key: {
+                "intercept": round(model.intercept, 4),
+                "weights": {name: round(float(w), 4) for name, w in zip(names, model.weights, strict=True)},
+            }
+            for key, (names, model) in models.items()
+        }
 
 
 @cache
 def shipped() -> Calibration:
     """Return the calibration that comes with the package."""
     data = json.loads((resources.files(__package__) / FILE).read_text(encoding="utf-8"))
-    weights = tuple(float(data["weights"][name]) for name in FEATURES)
-    return Calibration(float(data["intercept"]), weights, data["about"])
+    fit, unique = (
+        Logistic(float(one["intercept"]), tuple(float(one["weights"][name]) for name in names))
+        for one, names in ((data["fit"], FIT), (data["unique"], UNIQUE))
+    )
+    return Calibration(fit, unique, data["about"])
 
 
 def probability_of(metrics: Mapping[str, Any]) -> float | None:

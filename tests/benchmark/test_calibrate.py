@@ -10,25 +10,29 @@ import pytest
 from mtpcr_geo.benchmark.robustness.calibrate import calibrate, calibration_error, fit, reliability
 from mtpcr_geo.benchmark.robustness.results import RowFile
 from mtpcr_geo.core.errors import InputError
-from mtpcr_geo.verdict.probability import FEATURES
+from mtpcr_geo.verdict.probability import FIT, UNIQUE
 
 
 def drawn(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    features = rng.normal(size=(count, 3))
-    odds = -0.5 + features @ np.array([2.0, 1.0, 0.0])
-    return features, rng.uniform(size=count) < 1.0 / (1.0 + np.exp(-odds))
+    features = 2.0 * rng.normal(size=(count, 3))
+    odds = -0.5 + features[:, :2] @ np.array([2.0, 1.0]), 1.0 + features[:, 2:] @ np.array([1.5])
+    chance = [1.0 / (1.0 + np.exp(-one)) for one in odds]
+    return features, rng.uniform(size=count) < chance[0] * chance[1]
 
 
 def test_the_fit_recovers_the_model_that_runs_were_drawn_from() -> None:
-    intercept, weights = fit(*drawn(20_000, 1))
-    assert intercept == pytest.approx(-0.5, abs=0.1)
-    assert weights == pytest.approx([2.0, 1.0, 0.0], abs=0.1)
+    fits, unique = fit(*drawn(20_000, 1), split=2)
+    assert fits.intercept == pytest.approx(-0.5, abs=0.15)
+    assert fits.weights == pytest.approx([2.0, 1.0], abs=0.15)
+    assert unique.intercept == pytest.approx(1.0, abs=0.15)
+    assert unique.weights == pytest.approx([1.5], abs=0.15)
 
 
 def test_no_weight_is_negative() -> None:
     features, right = drawn(2_000, 2)
-    assert (fit(-features, right)[1] >= 0.0).all()
+    for model in fit(-features, right, split=2):
+        assert min(model.weights) >= 0.0
 
 
 def test_probabilities_that_are_true_have_no_calibration_error() -> None:
@@ -62,7 +66,8 @@ def rows_into(path: Path, count: int) -> Path:
 def test_calibration_is_written_and_shown_on_other_sites(tmp_path: Path) -> None:
     text = calibrate([rows_into(tmp_path / "robustness.csv", 400)], tmp_path / "out")
     data = json.loads((tmp_path / "out" / "calibration.json").read_text("utf-8"))
-    assert set(data["weights"]) == set(FEATURES)
+    assert set(data["fit"]["weights"]) == set(FIT)
+    assert set(data["unique"]["weights"]) == set(UNIQUE)
     assert data["about"]["fitted_runs"] + data["about"]["shown_runs"] == 400
     assert data["about"]["shown_calibration_error"] < 0.1
     assert "expected calibration error" in text

@@ -7,7 +7,7 @@ import pytest
 
 from mtpcr_geo.verdict.decision import Limits, assess, metrics_of
 from mtpcr_geo.verdict.limits import Evidence
-from mtpcr_geo.verdict.probability import FEATURES, features_of, probability_of, shipped
+from mtpcr_geo.verdict.probability import FIT, UNIQUE, features_of, probability_of, shipped
 
 CLEAR = Evidence(
     held_out=40, held_out_agreeing=34, chance=0.06, tolerance_m=1.0, held_out_median_m=0.3, margin=6.0,
@@ -34,7 +34,7 @@ def test_clear_evidence_is_nearly_sure_and_accepted() -> None:
     "changes",
     [
         {"margin": 1.5}, {"null_ratio": 1.2}, {"held_out_agreeing": 5}, {"ground_spread_m": 0.5},
-        {"ground_agreeing": 500}, {"refinement_lost": True},
+        {"ground_agreeing": 500}, {"refinement_lost": True}, {"objects_missing": 0.2},
     ],
 )  # fmt: skip
 def test_weaker_evidence_never_raises_the_probability(changes: dict) -> None:
@@ -43,8 +43,15 @@ def test_weaker_evidence_never_raises_the_probability(changes: dict) -> None:
 
 def test_no_piece_of_evidence_counts_against_a_pose() -> None:
     model = shipped()
-    assert len(model.weights) == len(FEATURES)
-    assert min(model.weights) >= 0.0
+    for part, names in ((model.fit, FIT), (model.unique, UNIQUE)):
+        assert len(part.weights) == len(names)
+        assert min(part.weights) >= 0.0
+
+
+@pytest.mark.parametrize("changes", [{"null_ratio": 1.2}, {"objects_missing": 0.2}])
+def test_a_pose_that_may_merely_look_alike_is_not_called_probable(changes: dict) -> None:
+    # a site turned by half a turn: everything fits, but its mirror image does too, or its objects are missing
+    assert probability(**changes) < 0.5
 
 
 def test_what_unrelated_places_reach_is_refused_with_what_was_found() -> None:

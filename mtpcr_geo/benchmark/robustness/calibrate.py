@@ -24,12 +24,16 @@ from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.core.version import __version__
 from mtpcr_geo.io.outputs import OutputSet
-from mtpcr_geo.verdict.probability import FEATURES, FILE, Calibration, features_of
+from mtpcr_geo.verdict.probability import FILE, FIT, Calibration, Logistic, features_of
 
-RIDGE = 0.3
-"""Weight of the squared coefficients in the fit: without it a separable set would make them infinite."""
+RIDGE, RIDGE_UNIQUE = 0.1, 0.02
+"""Weight of the squared coefficients in the fit: without it a separable set would make them infinite. The
+evidence that a pose is unique spans a smaller range, and wants larger coefficients."""
+FIRST = (-2.0, 1.0)
+"""Intercepts that the fit starts from: most poses do not fit, and few of those that do look alike."""
 BINS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0)
 FEWEST = 10
+_LEAST = 1e-12
 REPORT, DIAGRAM = "calibration.md", "reliability.png"
 
 
@@ -38,7 +42,7 @@ class Runs:
     """Runs with evidence.
 
     Attributes:
-        features: (n, f) see `FEATURES`.
+        features: (n, f) see `mtpcr_geo.verdict.probability.features_of`.
         right: (n,) whether the pose is right; a run without a right answer is wrong.
         fitted: (n,) whether the site is of the half that is fitted to.
         rows: the rows.
@@ -72,30 +76,46 @@ def runs_of(rows: Sequence[Row]) -> Runs:
     return Runs(np.array([features for _, features in kept]), right, fitted, tuple(row for row, _ in kept))
 
 
-def fit(features: Floats, right: Mask) -> tuple[float, Floats]:
-    """Fit a logistic model whose weights are not negative.
+def fit(features: Floats, right: Mask, split: int = len(FIT)) -> tuple[Logistic, Logistic]:
+    """Fit the product of two logistic models whose weights are not negative.
 
     Args:
         features: (n, f).
         right: (n,).
+        split: the first so many features are the first model's, the others the second's.
 
     Returns:
-        The intercept, and (f,) weights.
+        Both models.
 
     """
-    sign = np.where(right, 1.0, -1.0)
-    A = np.column_stack([np.ones(len(features)), features])
+    groups = (features[:, :split], features[:, split:])
+    designs = [np.column_stack([np.ones(len(one)), one]) for one in groups]
+    ridges = [
+        ridge * np.r_[0.0, np.ones(one.shape[1])]
+        for ridge, one in zip((RIDGE, RIDGE_UNIQUE), groups, strict=True)
+    ]
+    cut = split + 1
 
     def loss(w: Floats) -> tuple[float, Floats]:
-        odds = sign * (A @ w)
-        value = float(np.logaddexp(0.0, -odds).sum() + RIDGE * (w[1:] ** 2).sum())
-        slope = -(A * (sign / (1.0 + np.exp(odds)))[:, None]).sum(axis=0)
-        slope[1:] += 2 * RIDGE * w[1:]
-        return value, slope
+        parts = (w[:cut], w[cut:])
+        odds = [A @ part for A, part in zip(designs, parts, strict=True)]
+        log_p = -sum(np.logaddexp(0.0, -one) for one in odds)
+        wrong = np.maximum(-np.expm1(log_p), _LEAST)
+        value = -np.where(right, log_p, np.log(wrong)).sum()
+        # of log p by the odds of one model: the probability that this one says no
+        outer = np.where(right, -1.0, np.exp(log_p) / wrong)
+        slopes = []
+        for A, part, ridge, one in zip(designs, parts, ridges, odds, strict=True):
+            value += (ridge * part**2).sum()
+            slopes.append(A.T @ (outer / (1.0 + np.exp(one))) + 2 * ridge * part)
+        return float(value), np.concatenate(slopes)
 
-    bounds = [(None, None), *[(0.0, None)] * features.shape[1]]
-    found = minimize(loss, np.zeros(A.shape[1]), jac=True, method="L-BFGS-B", bounds=bounds)
-    return float(found.x[0]), np.asarray(found.x[1:])
+    starts, bounds = [], []
+    for first, one in zip(FIRST, groups, strict=True):
+        starts += [first, *np.ones(one.shape[1])]
+        bounds += [(None, None), *[(0.0, None)] * one.shape[1]]
+    w = minimize(loss, np.array(starts), jac=True, method="L-BFGS-B", bounds=bounds).x
+    return Logistic(float(w[0]), tuple(w[1:cut])), Logistic(float(w[cut]), tuple(w[cut + 1 :]))
 
 
 def reliability(probability: Floats, right: Mask) -> list[dict[str, Any]]:
@@ -139,8 +159,8 @@ def calibrate(paths: Sequence[Path], out: Path) -> str:
 
     """
     runs = runs_of([row for path in paths for row in read_rows(path)])
-    intercept, weights = fit(runs.features[runs.fitted], runs.right[runs.fitted])
-    model = Calibration(intercept, tuple(weights), {})
+    models = fit(runs.features[runs.fitted], runs.right[runs.fitted])
+    model = Calibration(*models, {})
     shown = ~runs.fitted
     probability = model.probability(runs.features)
     lines = reliability(probability[shown], runs.right[shown])
@@ -156,11 +176,7 @@ def calibrate(paths: Sequence[Path], out: Path) -> str:
         "shown_brier": round(float(((probability - runs.right)[shown] ** 2).mean()), 4),
         "suites": sorted({str(row["suite"]) for row in runs.rows}),
     }
-    data = {
-        "about": about,
-        "intercept": round(intercept, 4),
-        "weights": {name: round(float(w), 4) for name, w in zip(FEATURES, weights, strict=True)},
-    }
+    data = Calibration(*models, about).as_json()
     table = to_markdown(lines)
     text = f"# Calibration of the verdict's probability\n\n{_sentence(about)}\n\n{table}\n"
     with OutputSet(overwrite=True) as files:
