@@ -268,7 +268,12 @@ def null_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
     text = f"it fits only {value} times as well as {mirrored} (wanted {wanted})"
     if evidence.null_ratio < 1.0:
         text = f"it fits less well than {mirrored} ({value} times, wanted {wanted})"
-    return CheckFinding(f"{text}; the pose is no surer than chance makes one; {_LOOK}")
+    if neg_log10_p_of(evidence) < limits.neg_log10_p:
+        return CheckFinding(f"{text}; the pose is no surer than chance makes one; {_LOOK}")
+    return CheckFinding(
+        f"{text}, though more tie points agree than by chance: a symmetrical site, or one with little in it, "
+        "may fit as well turned by half a turn; give more of what lies around it"
+    )
 
 
 def overlap_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:

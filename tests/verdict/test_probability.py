@@ -93,3 +93,11 @@ def test_features_are_bounded() -> None:
     found = features_of(metrics_of(replace(CLEAR, margin=1e9, null_ratio=1e-9, ground_spread_m=0.0)))
     assert found is not None
     assert np.isfinite(found).all()
+
+
+def test_a_site_that_is_its_own_mirror_image_is_told_from_one_where_nothing_stands_out() -> None:
+    symmetrical = assess(replace(CLEAR, null_ratio=1.1), Limits())
+    assert symmetrical.name == "refused"
+    assert any("half a turn" in reason for reason in symmetrical.reasons)
+    bare = assess(replace(CLEAR, null_ratio=1.1, held_out_agreeing=4), Limits())
+    assert any("no surer than chance" in reason for reason in bare.reasons)
