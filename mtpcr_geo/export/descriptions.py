@@ -43,6 +43,7 @@ _LABELS = {
     "ground_spread_m": "ground, spread of the height differences",
     "ground_relief_m": "ground, relief",
     "probability": "probability of being right (5 degrees, 2 m)",
+    "probability_precise": "probability of being precise (0.2 degrees, 0.5 m)",
     "refinement_lost": "refinement lost the tie points",
     "refined_away_m": "moved by the refinement",
     "vertical_offset_m": "height offset found",
@@ -67,7 +68,9 @@ _LABELS = {
     "tie_points_height_off": "of these, off in height",
 }
 _UNITS = (("_m2", "m²"), ("_m", "m"), ("_deg", "°"), ("_s", "s"), ("_mb", "MB"), ("_cells", "cells"))
-_SHARES = ("_share", "overlap_source", "overlap_target", "_support")
+_SHARES = (
+    "_share", "overlap_source", "overlap_target", "_support", "probability", "probability_precise",
+)  # fmt: skip
 
 
 def verdict_meaning(pair: Pair) -> str:

@@ -109,6 +109,8 @@ The metrics:
 - ``metrics.ground_relief_m``: relief of the ground in those blocks, a plane taken off; null if unknown
 - ``metrics.probability``: probability of being within 5 degrees and 2 m of the truth, from a model fitted to
   runs of known answer; null from keypoints
+- ``metrics.probability_precise``: the same of being within 0.2 degrees and 0.5 m, from that and from the
+  uncertainty; null where either is not known
 - ``metrics.refinement_lost``: whether surfaces fit better where the tie points do not agree
 - ``metrics.refined_away_m``: how far the refinement moved the middle of the tie points, in plan
 - ``metrics.vertical_offset_m``: metres added to the source's heights, with vertical: estimate

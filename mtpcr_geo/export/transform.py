@@ -239,6 +239,7 @@ def _verdict(pair: Pair, forced: bool) -> dict[str, Any] | None:
         "name": pair.verdict.name,
         "sentence": pair.verdict.headline,
         "probability": pair.verdict.metrics.get("probability"),
+        "probability_precise": pair.verdict.metrics.get("probability_precise"),
         "sigmas": {name: pair.verdict.metrics.get(name) for name in names},
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "calibrated": calibrated(pair.verdict),

@@ -33,7 +33,7 @@ from mtpcr_geo.verdict.findings import (
     refinement_findings,
 )
 from mtpcr_geo.verdict.limits import Evidence, Limits
-from mtpcr_geo.verdict.probability import probability_of
+from mtpcr_geo.verdict.probability import probability_of, probability_of_precise
 from mtpcr_geo.verdict.sentence import sentence_of
 
 __all__ = ["Evidence", "Limits", "assess"]
@@ -50,6 +50,8 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
     """
     metrics = metrics_of(evidence)
     probability = metrics["probability"] = probability_of(metrics)
+    known = {} if evidence.uncertainty is None else evidence.uncertainty.metrics
+    metrics["probability_precise"] = probability_of_precise(metrics | known)
     if probability is None:
         judged = held_out_finding(evidence, limits)
         weak = bool(metrics["neg_log10_p"] < limits.neg_log10_p)

@@ -54,6 +54,14 @@ UNIQUE = ("mirror", "objects")
 """
 
 
+PRECISE = ("plan", "rotation")
+"""What says that a right pose is precise: logarithms of the tolerance over what 95 % of the errors in plan
+stay below, and over twice the standard deviation of the rotation."""
+PRECISE_WITHIN = (0.2, 0.5)
+"""Degrees, and metres in plan in the middle of the overlap, within which a pose is precise."""
+_FINEST = (0.005, 0.01)
+
+
 def features_of(metrics: Mapping[str, Any]) -> Floats | None:
     """Return the evidence of a verdict's metrics as numbers.
 
@@ -88,6 +96,23 @@ def features_of(metrics: Mapping[str, Any]) -> Floats | None:
     )
 
 
+def precise_features_of(metrics: Mapping[str, Any]) -> Floats | None:
+    """Return how the stated accuracy compares with what is called precise.
+
+    Args:
+        metrics: of a verdict, with those of its uncertainty.
+
+    Returns:
+        (2,) in the order of `PRECISE`; None where the accuracy is not known.
+
+    """
+    plan, yaw, tilt = (metrics.get(name) for name in ("within_95_plan_m", "sigma_yaw_deg", "sigma_tilt_deg"))
+    if plan is None or yaw is None or tilt is None:
+        return None
+    rotation = max(2.0 * float(np.hypot(yaw, tilt)), _FINEST[0])
+    return np.log([PRECISE_WITHIN[1] / max(plan, _FINEST[1]), PRECISE_WITHIN[0] / rotation])
+
+
 @dataclass(frozen=True)
 class Logistic:
     """A logistic model.
@@ -114,12 +139,14 @@ class Calibration:
     Attributes:
         fit: that the clouds fit, of the features of `FIT`.
         unique: that no other pose looks alike, of those of `UNIQUE`.
+        precise: that a right pose is precise, of those of `PRECISE`.
         about: what it was fitted to, when, and how it does on other sites.
 
     """
 
     fit: Logistic
     unique: Logistic
+    precise: Logistic
     about: Mapping[str, Any]
 
     def probability(self, features: Floats) -> Floats:
@@ -131,7 +158,11 @@ class Calibration:
 
     def as_json(self) -> dict[str, Any]:
         """Return what `FILE` holds."""
-        models = {"fit": (FIT, self.fit), "unique": (UNIQUE, self.unique)}
+        models = {
+            "fit": (FIT, self.fit),
+            "unique": (UNIQUE, self.unique),
+            "precise": (PRECISE, self.precise),
+        }
         return {"about": dict(self.about)} | {
             key: {
                 "intercept": round(model.intercept, 4),
@@ -145,11 +176,15 @@ class Calibration:
 def shipped() -> Calibration:
     """Return the calibration that comes with the package."""
     data = json.loads((resources.files(__package__) / FILE).read_text(encoding="utf-8"))
-    fit, unique = (
+    fit, unique, precise = (
         Logistic(float(one["intercept"]), tuple(float(one["weights"][name]) for name in names))
-        for one, names in ((data["fit"], FIT), (data["unique"], UNIQUE))
+        for one, names in (
+            (data["fit"], FIT),
+            (data["unique"], UNIQUE),
+            (data["precise"], PRECISE),
+        )
     )
-    return Calibration(fit, unique, data["about"])
+    return Calibration(fit, unique, precise, data["about"])
 
 
 def probability_of(metrics: Mapping[str, Any]) -> float | None:
@@ -164,3 +199,19 @@ def probability_of(metrics: Mapping[str, Any]) -> float | None:
     """
     features = features_of(metrics)
     return None if features is None else float(shipped().probability(features))
+
+
+def probability_of_precise(metrics: Mapping[str, Any]) -> float | None:
+    """Return how probable it is that a pose is precise: as near the truth as `PRECISE_WITHIN`.
+
+    Args:
+        metrics: of a verdict, with those of its uncertainty.
+
+    Returns:
+        0 to 1: that it is right, times that a right one is precise; None where either is not known.
+
+    """
+    right, features = probability_of(metrics), precise_features_of(metrics)
+    if right is None or features is None:
+        return None
+    return right * float(shipped().precise.probability(features))

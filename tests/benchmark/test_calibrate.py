@@ -10,7 +10,7 @@ import pytest
 from mtpcr_geo.benchmark.robustness.calibrate import calibrate, calibration_error, fit, reliability
 from mtpcr_geo.benchmark.robustness.results import RowFile
 from mtpcr_geo.core.errors import InputError
-from mtpcr_geo.verdict.probability import FIT, UNIQUE
+from mtpcr_geo.verdict.probability import FIT, PRECISE, UNIQUE
 
 
 def drawn(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -54,10 +54,13 @@ def rows_into(path: Path, count: int) -> Path:
                 "hypothesis_margin": strength, "null_ratio": strength, "neg_log10_p": 20.0 if right else 2.0,
                 "ground_cells": 100, "ground_checked": True, "ground_agreeing": 95 if right else 60,
             }  # fmt: skip
+            plan = float(rng.lognormal(-1.0, 1.0))
+            precise = bool(rng.uniform() < 1.0 / (1.0 + (plan / 0.5) ** 2))
+            metrics |= {"within_95_plan_m": plan, "sigma_yaw_deg": 0.05, "sigma_tilt_deg": 0.05}
             file.append(
                 {
                     "case": str(number), "suite": "s", "site": f"site_{number % 8}", "has_truth": True,
-                    "right": right, "metrics": metrics,
+                    "right": right, "precise": right and precise, "metrics": metrics,
                 }
             )  # fmt: skip
     return path
@@ -68,9 +71,12 @@ def test_calibration_is_written_and_shown_on_other_sites(tmp_path: Path) -> None
     data = json.loads((tmp_path / "out" / "calibration.json").read_text("utf-8"))
     assert set(data["fit"]["weights"]) == set(FIT)
     assert set(data["unique"]["weights"]) == set(UNIQUE)
+    assert set(data["precise"]["weights"]) == set(PRECISE)
     assert data["about"]["fitted_runs"] + data["about"]["shown_runs"] == 400
     assert data["about"]["shown_calibration_error"] < 0.1
     assert "expected calibration error" in text
+    assert "within 0.2 degrees and 0.5 m" in text
+    assert data["precise"]["weights"]["plan"] == pytest.approx(2.0, abs=0.5)
 
 
 def test_too_few_runs_are_refused(tmp_path: Path) -> None:

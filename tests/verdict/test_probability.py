@@ -7,7 +7,15 @@ import pytest
 
 from mtpcr_geo.verdict.decision import Limits, assess, metrics_of
 from mtpcr_geo.verdict.limits import Evidence
-from mtpcr_geo.verdict.probability import FIT, UNIQUE, features_of, probability_of, shipped
+from mtpcr_geo.verdict.probability import (
+    FIT,
+    PRECISE,
+    UNIQUE,
+    features_of,
+    probability_of,
+    probability_of_precise,
+    shipped,
+)
 
 CLEAR = Evidence(
     held_out=40, held_out_agreeing=34, chance=0.06, tolerance_m=1.0, held_out_median_m=0.3, margin=6.0,
@@ -43,7 +51,7 @@ def test_weaker_evidence_never_raises_the_probability(changes: dict) -> None:
 
 def test_no_piece_of_evidence_counts_against_a_pose() -> None:
     model = shipped()
-    for part, names in ((model.fit, FIT), (model.unique, UNIQUE)):
+    for part, names in ((model.fit, FIT), (model.unique, UNIQUE), (model.precise, PRECISE)):
         assert len(part.weights) == len(names)
         assert min(part.weights) >= 0.0
 
@@ -101,3 +109,18 @@ def test_a_site_that_is_its_own_mirror_image_is_told_from_one_where_nothing_stan
     assert any("half a turn" in reason for reason in symmetrical.reasons)
     bare = assess(replace(CLEAR, null_ratio=1.1, held_out_agreeing=4), Limits())
     assert any("no surer than chance" in reason for reason in bare.reasons)
+
+
+def test_what_is_stated_exactly_is_probably_precise_and_never_more_so_than_right() -> None:
+    metrics = metrics_of(CLEAR)
+    assert probability_of_precise(metrics) is None  # nothing is known of its accuracy
+    found = [
+        probability_of_precise(
+            metrics | {"within_95_plan_m": plan, "sigma_yaw_deg": turn, "sigma_tilt_deg": turn}
+        )
+        for plan, turn in ((0.05, 0.01), (0.5, 0.01), (0.5, 0.2), (3.0, 0.5))
+    ]
+    assert found == sorted(found, reverse=True)
+    assert found[0] > 0.95
+    assert found[-1] < 0.1
+    assert all(one <= probability() for one in found)

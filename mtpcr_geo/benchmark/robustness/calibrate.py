@@ -24,11 +24,20 @@ from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.core.version import __version__
 from mtpcr_geo.io.outputs import OutputSet
-from mtpcr_geo.verdict.probability import FILE, FIT, Calibration, Logistic, features_of
+from mtpcr_geo.verdict.probability import (
+    FILE,
+    FIT,
+    PRECISE,
+    Calibration,
+    Logistic,
+    features_of,
+    precise_features_of,
+)
 
 RIDGE, RIDGE_UNIQUE = 0.1, 0.02
 """Weight of the squared coefficients in the fit: without it a separable set would make them infinite. The
 evidence that a pose is unique spans a smaller range, and wants larger coefficients."""
+RIDGE_PRECISE, NORMAL_WEIGHT = 3.0, 2.0
 FIRST = (-2.0, 1.0)
 """Intercepts that the fit starts from: most poses do not fit, and few of those that do look alike."""
 BINS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0)
@@ -118,6 +127,46 @@ def fit(features: Floats, right: Mask, split: int = len(FIT)) -> tuple[Logistic,
     return Logistic(float(w[0]), tuple(w[1:cut])), Logistic(float(w[cut]), tuple(w[cut + 1 :]))
 
 
+def fit_precise(runs: Runs) -> Logistic:
+    """Fit the model that a right pose is precise, to the right runs of the half that is fitted to.
+
+    Its weights are drawn to what an error of normal distribution has.
+    """
+    known = [
+        (features, bool(row["precise"]))
+        for row, right, fitted in zip(runs.rows, runs.right, runs.fitted, strict=True)
+        if right and fitted and (features := precise_features_of(row["metrics"])) is not None
+    ]
+    features = np.array([one for one, _ in known]).reshape(-1, len(PRECISE))
+    sign = np.array([1.0 if precise else -1.0 for _, precise in known])
+    A = np.column_stack([np.ones(len(features)), features])
+
+    def loss(w: Floats) -> tuple[float, Floats]:
+        odds, off = sign * (A @ w), w[1:] - NORMAL_WEIGHT
+        slope = -(A * (sign / (1.0 + np.exp(odds)))[:, None]).sum(axis=0)
+        slope[1:] += 2 * RIDGE_PRECISE * off
+        return float(np.logaddexp(0.0, -odds).sum() + RIDGE_PRECISE * (off**2).sum()), slope
+
+    start = np.r_[0.0, np.full(len(PRECISE), NORMAL_WEIGHT)]
+    bounds = [(None, None), *[(0.0, None)] * len(PRECISE)]
+    w = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
+    return Logistic(float(w[0]), tuple(w[1:]))
+
+
+def shown_precise(runs: Runs, model: Calibration) -> list[dict[str, Any]]:
+    """Return the reliability of the probability of being precise on the half that was not fitted to."""
+    known = [
+        (row, features, precise)
+        for row, features, fitted in zip(runs.rows, runs.features, runs.fitted, strict=True)
+        if not fitted and (precise := precise_features_of(row["metrics"])) is not None
+    ]
+    said = np.array(
+        [model.probability(features) * model.precise.probability(precise) for _, features, precise in known]
+    )
+    found = np.array([bool(row["has_truth"] and row["precise"]) for row, _, _ in known], bool)
+    return reliability(said, found) if known else []
+
+
 def reliability(probability: Floats, right: Mask) -> list[dict[str, Any]]:
     """Return for each bin of probability its runs, their mean probability, and the share that is right."""
     lines = []
@@ -159,11 +208,12 @@ def calibrate(paths: Sequence[Path], out: Path) -> str:
 
     """
     runs = runs_of([row for path in paths for row in read_rows(path)])
-    models = fit(runs.features[runs.fitted], runs.right[runs.fitted])
+    models = (*fit(runs.features[runs.fitted], runs.right[runs.fitted]), fit_precise(runs))
     model = Calibration(*models, {})
     shown = ~runs.fitted
     probability = model.probability(runs.features)
     lines = reliability(probability[shown], runs.right[shown])
+    precise = shown_precise(runs, model)
     about = {
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "version": __version__,
@@ -174,11 +224,17 @@ def calibrate(paths: Sequence[Path], out: Path) -> str:
         "shown_right": int((runs.right & shown).sum()),
         "shown_calibration_error": round(calibration_error(lines), 4),
         "shown_brier": round(float(((probability - runs.right)[shown] ** 2).mean()), 4),
+        "shown_precise_calibration_error": round(calibration_error(precise), 4) if precise else None,
         "suites": sorted({str(row["suite"]) for row in runs.rows}),
     }
     data = Calibration(*models, about).as_json()
-    table = to_markdown(lines)
-    text = f"# Calibration of the verdict's probability\n\n{_sentence(about)}\n\n{table}\n"
+    text = f"# Calibration of the verdict's probability\n\n{_sentence(about)}\n\n{to_markdown(lines)}\n"
+    if precise:
+        error = calibration_error(precise)
+        text += (
+            "\n## Of being within 0.2 degrees and 0.5 m\n\nOn the same half: expected calibration error "
+            f"{error:.4f}.\n\n{to_markdown(precise)}\n"
+        )
     with OutputSet(overwrite=True) as files:
         files.path(Path(out) / FILE).write_text(json.dumps(data, indent=2) + "\n", "utf-8")
         files.path(Path(out) / REPORT).write_text(text, "utf-8")

@@ -116,15 +116,15 @@ def accuracy(verdict: Verdict | None) -> Accuracy | None:
 
 
 def rotation_rows(verdict: Verdict | None) -> list[Row]:
-    """Return the standard deviations of the rotation."""
+    """Return the standard deviations of the rotation, and how probable it is that the pose is precise."""
     if verdict is None or verdict.uncertainty is None or verdict.name == "refused":
         return []
+    named = [(f"standard deviation of the {one}", f"sigma_{one}_deg") for one in ("yaw", "tilt")]
+    if verdict.metrics.get("probability_precise") is not None:
+        named.append(("probability of being within 0.2° and 0.5 m", "probability_precise"))
     return [
-        row(
-            f"standard deviation of the {name}",
-            metric(verdict, key, printed(verdict, key)),
-        )
-        for name, key in (("yaw", "sigma_yaw_deg"), ("tilt", "sigma_tilt_deg"))
+        row(name, metric(verdict, key, printed(verdict, key)))
+        for name, key in named
         if key in verdict.metrics
     ]
 
