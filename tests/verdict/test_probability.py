@@ -114,12 +114,12 @@ def test_a_site_that_is_its_own_mirror_image_is_told_from_one_where_nothing_stan
 def test_what_is_stated_exactly_is_probably_precise_and_never_more_so_than_right() -> None:
     metrics = metrics_of(CLEAR)
     assert probability_of_precise(metrics) is None  # nothing is known of its accuracy
-    found = [
-        probability_of_precise(
-            metrics | {"within_95_plan_m": plan, "sigma_yaw_deg": turn, "sigma_tilt_deg": turn}
-        )
-        for plan, turn in ((0.05, 0.01), (0.5, 0.01), (0.5, 0.2), (3.0, 0.5))
-    ]
+    found = []
+    for plan, turn in ((0.05, 0.01), (0.5, 0.01), (0.5, 0.2), (3.0, 0.5)):
+        stated = {"within_95_plan_m": plan, "sigma_yaw_deg": turn, "sigma_tilt_deg": turn}
+        one = probability_of_precise(metrics | stated)
+        assert one is not None
+        found.append(one)
     assert found == sorted(found, reverse=True)
     assert found[0] > 0.95
     assert found[-1] < 0.1
