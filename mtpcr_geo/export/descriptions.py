@@ -15,6 +15,7 @@ from mtpcr_geo.core.types import IcpResult, Pair, Side, Verdict
 from mtpcr_geo.crs import FrameLink, TransformChain, facts_of
 from mtpcr_geo.export.tie_points import tie_positions
 from mtpcr_geo.export.transform import cloudcompare_of, units_of
+from mtpcr_geo.verdict.findings import probability_text
 
 Row = tuple[str, str]
 
@@ -68,9 +69,8 @@ _LABELS = {
     "tie_points_height_off": "of these, off in height",
 }
 _UNITS = (("_m2", "m²"), ("_m", "m"), ("_deg", "°"), ("_s", "s"), ("_mb", "MB"), ("_cells", "cells"))
-_SHARES = (
-    "_share", "overlap_source", "overlap_target", "_support", "probability", "probability_precise",
-)  # fmt: skip
+_SHARES = ("_share", "overlap_source", "overlap_target", "_support")
+_PROBABILITIES = ("probability", "probability_precise")
 
 
 def verdict_meaning(pair: Pair) -> str:
@@ -388,6 +388,8 @@ def _metric_row(key: str, value: Any) -> Row:
         return _label(key, "_m"), f"{_numbers(np.asarray(value), 3)} m"
     if not isinstance(value, int | float):
         return _label(key), plain(value)
+    if key in _PROBABILITIES:
+        return _label(key), probability_text(float(value))
     if key.endswith(_SHARES):
         return _label(key), f"{100 * float(value):.1f} %"
     for suffix, unit in _UNITS:

@@ -12,6 +12,7 @@ from mtpcr_geo.verdict.findings import (
     FLAT_GROUND_M,
     ground_checked,
     neg_log10_p_of,
+    probability_text,
 )
 from mtpcr_geo.verdict.limits import Evidence, Limits
 from mtpcr_geo.verdict.sliding import weakness_text
@@ -69,7 +70,7 @@ def _probability(evidence: Evidence, limits: Limits, probability: float | None) 
             "no model that makes a probability of it.",
         )
     value, wanted = percent(min(probability, 0.999), limits.probability)
-    value = "more than 99 %" if probability > 0.99 else value
+    value = probability_text(probability) if probability > 0.99 else value
     return Check(
         "probability",
         value,

@@ -67,7 +67,12 @@ def _times(ratio: float, below: str, above: str) -> str:
 
 def chance_text(probability: float) -> str:
     """Say a probability; what is nearly sure is said as such, since no run could show more digits."""
-    return "a probability of more than 99 %" if probability > 0.99 else f"a probability of {probability:.0%}"
+    return f"a probability of {probability_text(probability)}"
+
+
+def probability_text(probability: float) -> str:
+    """Say a probability without its name, see `chance_text`."""
+    return "more than 99 %" if probability > 0.99 else f"{100.0 * probability:.0f} %"
 
 
 def _for_more_evidence(evidence: Evidence) -> str:

@@ -4,8 +4,8 @@ A pose is right where the clouds fit under it, and where it is not one that mere
 site turned by half a turn fits as well as it does in its place. The probability is the product of both, each
 a logistic model, fitted together. Each piece of evidence may only speak for a pose: weights are not negative.
 What the model was fitted to, and how it does on sites that it was not fitted to, stands in
-``calibration.json`` beside this module; ``mtpcr-geo benchmark --calibrate`` makes it from the rows of
-robustness benchmarks.
+``calibration.json`` beside this module, and the runs themselves in ``calibration.csv``; ``mtpcr-geo benchmark
+--calibrate`` makes both from the rows of robustness benchmarks.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 
 from mtpcr_geo.core.arrays import Floats
 
-FILE = "calibration.json"
+FILE, DATA = "calibration.json", "calibration.csv"
 RATIOS = (0.2, 20.0)
 """Ratios of strengths to the next distinct pose's beyond which they say no more."""
 RELIEF_NOISE_M = 0.05
@@ -60,6 +60,7 @@ stay below, and over twice the standard deviation of the rotation."""
 PRECISE_WITHIN = (0.2, 0.5)
 """Degrees, and metres in plan in the middle of the overlap, within which a pose is precise."""
 _FINEST = (0.005, 0.01)
+"""Degrees and metres below which a stated accuracy says no more."""
 
 
 def features_of(metrics: Mapping[str, Any]) -> Floats | None:

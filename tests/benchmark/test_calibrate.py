@@ -1,16 +1,23 @@
 from __future__ import annotations
 
 import json
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from mtpcr_geo.benchmark.robustness.calibrate import calibrate, calibration_error, fit, reliability
+from mtpcr_geo.benchmark.robustness.calibrate import (
+    Part,
+    calibrate,
+    calibration_error,
+    fit,
+    reliability,
+)
 from mtpcr_geo.benchmark.robustness.results import RowFile
 from mtpcr_geo.core.errors import InputError
-from mtpcr_geo.verdict.probability import FIT, PRECISE, UNIQUE
+from mtpcr_geo.verdict.probability import DATA, FILE, FIT, PRECISE, UNIQUE
 
 
 def drawn(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -21,8 +28,13 @@ def drawn(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return features, rng.uniform(size=count) < chance[0] * chance[1]
 
 
+def parts(features: np.ndarray) -> list[Part]:
+    return [Part(features[:, :2], 0.1), Part(features[:, 2:], 0.1, first=1.0)]
+
+
 def test_the_fit_recovers_the_model_that_runs_were_drawn_from() -> None:
-    fits, unique = fit(*drawn(20_000, 1), split=2)
+    features, right = drawn(20_000, 1)
+    fits, unique = fit(parts(features), right)
     assert fits.intercept == pytest.approx(-0.5, abs=0.15)
     assert fits.weights == pytest.approx([2.0, 1.0], abs=0.15)
     assert unique.intercept == pytest.approx(1.0, abs=0.15)
@@ -31,7 +43,7 @@ def test_the_fit_recovers_the_model_that_runs_were_drawn_from() -> None:
 
 def test_no_weight_is_negative() -> None:
     features, right = drawn(2_000, 2)
-    for model in fit(-features, right, split=2):
+    for model in fit(parts(-features), right):
         assert min(model.weights) >= 0.0
 
 
@@ -82,3 +94,17 @@ def test_calibration_is_written_and_shown_on_other_sites(tmp_path: Path) -> None
 def test_too_few_runs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="too few to calibrate"):
         calibrate([rows_into(tmp_path / "robustness.csv", 20)], tmp_path / "out")
+
+
+def test_the_runs_in_the_package_give_the_coefficients_in_the_package(tmp_path: Path) -> None:
+    package = resources.files("mtpcr_geo.verdict")
+    with resources.as_file(package / DATA) as runs:
+        calibrate([runs], tmp_path)
+        assert (tmp_path / DATA).read_bytes() == runs.read_bytes()
+    found, shipped = (json.loads(file.read_text("utf-8")) for file in (tmp_path / FILE, package / FILE))
+    for model in ("fit", "unique", "precise"):
+        assert found[model]["intercept"] == pytest.approx(shipped[model]["intercept"], abs=0.01)
+        assert found[model]["weights"] == pytest.approx(shipped[model]["weights"], abs=0.01)
+    same = ("fitted_runs", "fitted_right", "shown_runs", "shown_right", "suites")
+    assert [found["about"][name] for name in same] == [shipped["about"][name] for name in same]
+    assert shipped["about"]["shown_calibration_error"] < 0.05

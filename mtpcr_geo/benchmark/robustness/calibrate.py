@@ -1,18 +1,22 @@
 """Fits the probability of the verdict to rows of the robustness benchmark, and shows it on other sites.
 
 The sites are halved by name: the model is fitted to the runs of one half, and its reliability is that of the
-other. Runs without an answer have no evidence to weigh and are left out; so are those of other matchers.
+other. Runs without an answer have no evidence to weigh and are left out; so are those of other matchers. What
+the fit needs of each run is written beside the coefficients, and can be fitted again without the rows.
 """
 
 from __future__ import annotations
 
+import csv
 import datetime
+import io
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -25,25 +29,50 @@ from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.core.version import __version__
 from mtpcr_geo.io.outputs import OutputSet
 from mtpcr_geo.verdict.probability import (
+    DATA,
     FILE,
     FIT,
     PRECISE,
+    UNIQUE,
     Calibration,
     Logistic,
     features_of,
     precise_features_of,
 )
 
-RIDGE, RIDGE_UNIQUE = 0.1, 0.02
+RIDGE, RIDGE_UNIQUE, RIDGE_PRECISE = 0.1, 0.02, 3.0
 """Weight of the squared coefficients in the fit: without it a separable set would make them infinite. The
 evidence that a pose is unique spans a smaller range, and wants larger coefficients."""
-RIDGE_PRECISE, NORMAL_WEIGHT = 3.0, 2.0
-FIRST = (-2.0, 1.0)
-"""Intercepts that the fit starts from: most poses do not fit, and few of those that do look alike."""
+NORMAL_WEIGHT = 2.0
+"""Coefficients that the model of precise poses is drawn to: about those of errors of normal distribution."""
+DIGITS = 4
+"""Decimals of the features that are fitted to, as they are written."""
+_COLUMNS = ("suite", "site", "right", "precise", *FIT, *UNIQUE, *PRECISE)
+_LEAST = 1e-12
 BINS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0)
 FEWEST = 10
 _LEAST = 1e-12
 REPORT, DIAGRAM = "calibration.md", "reliability.png"
+
+
+class Run(NamedTuple):
+    """What the fit needs of a run.
+
+    Attributes:
+        suite, site: of the benchmark.
+        right: whether the pose is right; that of a run without a right answer is wrong.
+        precise: whether it is precise too.
+        features: of `FIT` and `UNIQUE`.
+        accuracy: of `PRECISE`; NaN where the accuracy is not known.
+
+    """
+
+    suite: str
+    site: str
+    right: bool
+    precise: bool
+    features: tuple[float, ...]
+    accuracy: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -51,120 +80,170 @@ class Runs:
     """Runs with evidence.
 
     Attributes:
+        rows: the runs.
         features: (n, f) see `mtpcr_geo.verdict.probability.features_of`.
-        right: (n,) whether the pose is right; a run without a right answer is wrong.
+        accuracy: (n, 2) see `mtpcr_geo.verdict.probability.precise_features_of`; NaN where not known.
+        right, precise: (n,) see `Run`.
         fitted: (n,) whether the site is of the half that is fitted to.
-        rows: the rows.
 
     """
 
+    rows: tuple[Run, ...]
     features: Floats
+    accuracy: Floats
     right: Mask
+    precise: Mask
     fitted: Mask
-    rows: tuple[Row, ...]
 
 
-def runs_of(rows: Sequence[Row]) -> Runs:
-    """Collect the runs that have evidence, and halve their sites.
+def run_of(row: Row) -> Run | None:
+    """Return what the fit needs of a row of the benchmark; None where it has no evidence."""
+    metrics = row["metrics"] or {}
+    features, accuracy = features_of(metrics), precise_features_of(metrics)
+    if features is None:
+        return None
+    right = bool(row["has_truth"] and row["right"])
+    return Run(
+        str(row["suite"]),
+        str(row["site"]),
+        right,
+        right and bool(row.get("precise")),
+        tuple(float(one) for one in features.round(DIGITS)),
+        (math.nan,) * len(PRECISE)
+        if accuracy is None
+        else tuple(float(one) for one in accuracy.round(DIGITS)),
+    )
+
+
+def read_runs(path: Path) -> list[Run]:
+    """Read runs: rows of the benchmark (``robustness.csv``), or what was kept of them (`DATA`).
+
+    Raises:
+        InputError: if the file cannot be read.
+
+    """
+    try:
+        with Path(path).open(encoding="utf-8", newline="") as file:
+            lines = csv.reader(file)
+            if tuple(next(lines, ())) == _COLUMNS:
+                return [_kept(line) for line in lines]
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read the runs in {path}: {error}") from error
+    return [run for row in read_rows(path) if (run := run_of(row)) is not None]
+
+
+def _kept(line: Sequence[str]) -> Run:
+    suite, site, right, precise, *figures = line
+    numbers = tuple(float(one) for one in figures)
+    split = len(FIT) + len(UNIQUE)
+    return Run(suite, site, right == "true", precise == "true", numbers[:split], numbers[split:])
+
+
+def _written(runs: Runs) -> str:
+    """Return the runs as `read_runs` reads them."""
+    text = io.StringIO()
+    lines = csv.writer(text, lineterminator="\n")
+    lines.writerow(_COLUMNS)
+    for run in runs.rows:
+        answers = [str(one).lower() for one in (run.right, run.precise)]
+        figures = [f"{one:.{DIGITS}f}" for one in (*run.features, *run.accuracy)]
+        lines.writerow([run.suite, run.site, *answers, *figures])
+    return text.getvalue()
+
+
+def runs_of(found: Sequence[Run]) -> Runs:
+    """Halve the sites of runs.
 
     Raises:
         InputError: if there are too few, or no right or no wrong ones in the half that is fitted to.
 
     """
-    known = [(row, features_of(row["metrics"] or {})) for row in rows]
-    kept = [(row, features) for row, features in known if features is not None]
-    names = sorted({str(row["site"]) for row, _ in kept})
-    half = {name: number % 2 == 0 for number, name in enumerate(names)}
-    right = np.array([bool(row["has_truth"] and row["right"]) for row, _ in kept])
-    fitted = np.array([half[str(row["site"])] for row, _ in kept])
+    half = {name: number % 2 == 0 for number, name in enumerate(sorted({run.site for run in found}))}
+    right = np.array([run.right for run in found], bool)
+    fitted = np.array([half[run.site] for run in found], bool)
     if min(int((right & fitted).sum()), int((~right & fitted).sum()), int((~fitted).sum())) < FEWEST:
         raise InputError(
-            f"{len(kept)} runs with evidence are too few to calibrate by: at least {FEWEST} right and "
+            f"{len(found)} runs with evidence are too few to calibrate by: at least {FEWEST} right and "
             f"{FEWEST} wrong ones are wanted in each half of the sites"
         )
-    return Runs(np.array([features for _, features in kept]), right, fitted, tuple(row for row, _ in kept))
+    features, accuracy = (
+        np.array([getattr(run, name) for run in found]) for name in ("features", "accuracy")
+    )
+    precise = np.array([run.precise for run in found], bool)
+    return Runs(tuple(found), features, accuracy, right, precise, fitted)
 
 
-def fit(features: Floats, right: Mask, split: int = len(FIT)) -> tuple[Logistic, Logistic]:
-    """Fit the product of two logistic models whose weights are not negative.
+@dataclass(frozen=True)
+class Part:
+    """One factor of a probability, to be fitted.
+
+    Attributes:
+        features: (n, f).
+        ridge: weight of the squared distance of its coefficients from ``toward``.
+        toward: what they are drawn to.
+        first: intercept that the fit starts from.
+
+    """
+
+    features: Floats
+    ridge: float
+    toward: float = 0.0
+    first: float = 0.0
+
+
+def fit(parts: Sequence[Part], yes: Mask) -> list[Logistic]:
+    """Fit a product of logistic models whose weights are not negative.
 
     Args:
-        features: (n, f).
-        right: (n,).
-        split: the first so many features are the first model's, the others the second's.
+        parts: the factors.
+        yes: (n,) the answers.
 
     Returns:
-        Both models.
+        A model for each.
 
     """
-    groups = (features[:, :split], features[:, split:])
-    designs = [np.column_stack([np.ones(len(one)), one]) for one in groups]
-    ridges = [
-        ridge * np.r_[0.0, np.ones(one.shape[1])]
-        for ridge, one in zip((RIDGE, RIDGE_UNIQUE), groups, strict=True)
-    ]
-    cut = split + 1
+    designs = [np.column_stack([np.ones(len(yes)), part.features]) for part in parts]
+    cuts = np.cumsum([design.shape[1] for design in designs])[:-1]
 
     def loss(w: Floats) -> tuple[float, Floats]:
-        parts = (w[:cut], w[cut:])
-        odds = [A @ part for A, part in zip(designs, parts, strict=True)]
-        log_p = -sum(np.logaddexp(0.0, -one) for one in odds)
-        wrong = np.maximum(-np.expm1(log_p), _LEAST)
-        value = -np.where(right, log_p, np.log(wrong)).sum()
-        # of log p by the odds of one model: the probability that this one says no
-        outer = np.where(right, -1.0, np.exp(log_p) / wrong)
+        pieces = np.split(w, cuts)
+        odds = [A @ piece for A, piece in zip(designs, pieces, strict=True)]
+        log_p = -np.sum([np.logaddexp(0.0, -one) for one in odds], axis=0)
+        log_q = np.log(np.maximum(-np.expm1(log_p), _LEAST))
+        value = -np.where(yes, log_p, log_q).sum()
+        # of the loss by log p; log p by the odds of a factor is the probability that this one says no
+        outer = np.where(yes, -1.0, np.exp(log_p - log_q))
         slopes = []
-        for A, part, ridge, one in zip(designs, parts, ridges, odds, strict=True):
-            value += (ridge * part**2).sum()
-            slopes.append(A.T @ (outer / (1.0 + np.exp(one))) + 2 * ridge * part)
+        for A, piece, part, one in zip(designs, pieces, parts, odds, strict=True):
+            off = np.r_[0.0, piece[1:] - part.toward]
+            value += part.ridge * (off**2).sum()
+            slopes.append(A.T @ (outer / (1.0 + np.exp(one))) + 2 * part.ridge * off)
         return float(value), np.concatenate(slopes)
 
-    starts, bounds = [], []
-    for first, one in zip(FIRST, groups, strict=True):
-        starts += [first, *np.ones(one.shape[1])]
-        bounds += [(None, None), *[(0.0, None)] * one.shape[1]]
+    starts: list[float] = []
+    bounds: list[tuple[float | None, None]] = []
+    for part, design in zip(parts, designs, strict=True):
+        count = design.shape[1] - 1
+        starts += [part.first, *[part.toward or 1.0] * count]
+        bounds += [(None, None), *[(0.0, None)] * count]
     w = minimize(loss, np.array(starts), jac=True, method="L-BFGS-B", bounds=bounds).x
-    return Logistic(float(w[0]), tuple(w[1:cut])), Logistic(float(w[cut]), tuple(w[cut + 1 :]))
+    return [Logistic(float(piece[0]), tuple(map(float, piece[1:]))) for piece in np.split(w, cuts)]
 
 
-def fit_precise(runs: Runs) -> Logistic:
-    """Fit the model that a right pose is precise, to the right runs of the half that is fitted to.
-
-    Its weights are drawn to what an error of normal distribution has.
-    """
-    known = [
-        (features, bool(row["precise"]))
-        for row, right, fitted in zip(runs.rows, runs.right, runs.fitted, strict=True)
-        if right and fitted and (features := precise_features_of(row["metrics"])) is not None
-    ]
-    features = np.array([one for one, _ in known]).reshape(-1, len(PRECISE))
-    sign = np.array([1.0 if precise else -1.0 for _, precise in known])
-    A = np.column_stack([np.ones(len(features)), features])
-
-    def loss(w: Floats) -> tuple[float, Floats]:
-        odds, off = sign * (A @ w), w[1:] - NORMAL_WEIGHT
-        slope = -(A * (sign / (1.0 + np.exp(odds)))[:, None]).sum(axis=0)
-        slope[1:] += 2 * RIDGE_PRECISE * off
-        return float(np.logaddexp(0.0, -odds).sum() + RIDGE_PRECISE * (off**2).sum()), slope
-
-    start = np.r_[0.0, np.full(len(PRECISE), NORMAL_WEIGHT)]
-    bounds = [(None, None), *[(0.0, None)] * len(PRECISE)]
-    w = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
-    return Logistic(float(w[0]), tuple(w[1:]))
-
-
-def shown_precise(runs: Runs, model: Calibration) -> list[dict[str, Any]]:
-    """Return the reliability of the probability of being precise on the half that was not fitted to."""
-    known = [
-        (row, features, precise)
-        for row, features, fitted in zip(runs.rows, runs.features, runs.fitted, strict=True)
-        if not fitted and (precise := precise_features_of(row["metrics"])) is not None
-    ]
-    said = np.array(
-        [model.probability(features) * model.precise.probability(precise) for _, features, precise in known]
+def fitted_to(runs: Runs) -> tuple[Logistic, Logistic, Logistic]:
+    """Fit the models of a `Calibration` to the half of the sites that is for it."""
+    half, split = runs.fitted, len(FIT)
+    # most poses do not fit, and few of those that do look alike
+    fits, unique = fit(
+        [
+            Part(runs.features[half, :split], RIDGE, first=-2.0),
+            Part(runs.features[half, split:], RIDGE_UNIQUE, first=1.0),
+        ],
+        runs.right[half],
     )
-    found = np.array([bool(row["has_truth"] and row["precise"]) for row, _, _ in known], bool)
-    return reliability(said, found) if known else []
+    known = half & runs.right & np.isfinite(runs.accuracy).all(axis=1)
+    (precise,) = fit([Part(runs.accuracy[known], RIDGE_PRECISE, NORMAL_WEIGHT)], runs.precise[known])
+    return fits, unique, precise
 
 
 def reliability(probability: Floats, right: Mask) -> list[dict[str, Any]]:
@@ -196,9 +275,9 @@ def calibrate(paths: Sequence[Path], out: Path) -> str:
     """Fit the model to one half of the sites, and write it with its reliability on the other.
 
     Args:
-        paths: ``robustness.csv`` files.
-        out: folder for ``calibration.json``, ``calibration.md`` and, where matplotlib is installed,
-            ``reliability.png``.
+        paths: ``robustness.csv`` files, or a ``calibration.csv`` of an earlier fit.
+        out: folder for ``calibration.json``, ``calibration.csv`` (the runs it was fitted to and shown on),
+            ``calibration.md`` and, where matplotlib is installed, ``reliability.png``.
 
     Returns:
         The reliability on the half that was not fitted to, as Markdown.
@@ -207,13 +286,14 @@ def calibrate(paths: Sequence[Path], out: Path) -> str:
         InputError: if a file cannot be read, or the runs are too few.
 
     """
-    runs = runs_of([row for path in paths for row in read_rows(path)])
-    models = (*fit(runs.features[runs.fitted], runs.right[runs.fitted]), fit_precise(runs))
+    runs = runs_of([run for path in paths for run in read_runs(path)])
+    models = fitted_to(runs)
     model = Calibration(*models, {})
-    shown = ~runs.fitted
+    shown, known = ~runs.fitted, np.isfinite(runs.accuracy).all(axis=1)
     probability = model.probability(runs.features)
     lines = reliability(probability[shown], runs.right[shown])
-    precise = shown_precise(runs, model)
+    said = probability * model.precise.probability(runs.accuracy)
+    precise = reliability(said[shown & known], runs.precise[shown & known])
     about = {
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "version": __version__,
@@ -225,7 +305,7 @@ def calibrate(paths: Sequence[Path], out: Path) -> str:
         "shown_calibration_error": round(calibration_error(lines), 4),
         "shown_brier": round(float(((probability - runs.right)[shown] ** 2).mean()), 4),
         "shown_precise_calibration_error": round(calibration_error(precise), 4) if precise else None,
-        "suites": sorted({str(row["suite"]) for row in runs.rows}),
+        "suites": sorted({run.suite for run in runs.rows}),
     }
     data = Calibration(*models, about).as_json()
     text = f"# Calibration of the verdict's probability\n\n{_sentence(about)}\n\n{to_markdown(lines)}\n"
@@ -237,6 +317,7 @@ def calibrate(paths: Sequence[Path], out: Path) -> str:
         )
     with OutputSet(overwrite=True) as files:
         files.path(Path(out) / FILE).write_text(json.dumps(data, indent=2) + "\n", "utf-8")
+        files.path(Path(out) / DATA).write_text(_written(runs), "utf-8")
         files.path(Path(out) / REPORT).write_text(text, "utf-8")
         _draw(lines, files, Path(out) / DIAGRAM)
         files.commit()

@@ -18,12 +18,11 @@ from mtpcr_geo.core.errors import MtpcrError
 from mtpcr_geo.core.system import peak_memory_mb, reset_peak_memory
 from mtpcr_geo.export.run_json import plain
 from mtpcr_geo.registration import Registration, register
+from mtpcr_geo.verdict.probability import PRECISE_WITHIN
 
 Row = dict[str, Any]
 RIGHT = (5.0, 2.0)
 """Degrees and metres below which a pose is right."""
-PRECISE = (0.2, 0.5)
-"""Degrees and metres below which it is precise."""
 SAMPLE = 5_000
 STRENGTHS = 5
 
@@ -167,7 +166,7 @@ def errors_of(T: Floats, clouds: CaseClouds) -> Row:
     shift = float(np.linalg.norm(step))
     return {
         "right": bool(rotation < RIGHT[0] and shift < RIGHT[1]),
-        "precise": bool(rotation < PRECISE[0] and shift < PRECISE[1]),
+        "precise": bool(rotation < PRECISE_WITHIN[0] and shift < PRECISE_WITHIN[1]),
         "rot_err_deg": rotation,
         "shift_err_m": shift,
         "plan_err_m": float(np.hypot(step[0], step[1])),
