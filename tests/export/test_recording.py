@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import select
 import subprocess
 import sys
+from concurrent.futures import wait
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -49,8 +53,8 @@ def states(pair: Pair):
     ]
 
 
-def record(path, pair: Pair, budget: Budget = SMALL) -> None:
-    recorder: Recorder = RerunRecorder(path, budget=budget)
+def record(path, pair: Pair, budget: Budget = SMALL, apart: bool = False) -> None:
+    recorder: Recorder = RerunRecorder(path, budget=budget, apart=apart)
     recorder.begin(FACTS)
     for tag, value in states(pair):
         recorder.after(f"mtpcr.{tag}", tag, {"cell": 1.0}, value, 0.25)
@@ -66,6 +70,28 @@ def rows(path, entity: str) -> list[dict]:
         if chunk.entity_path == entity:
             found += chunk.to_record_batch().to_pylist()
     return sorted(found, key=lambda row: row.get("stage") or 0)
+
+
+def rows_without_ids(path, entity: str) -> list[str]:
+    """What was recorded at an entity, in any order and without what is numbered at random."""
+    return sorted(
+        repr({name: value for name, value in sorted(row.items()) if "id" not in name.lower()})
+        for row in rows(path, entity)
+    )
+
+
+def ended(pid: int) -> bool:
+    """Whether a process is gone, or no more than its exit status is left; waits for it."""
+    for _ in range(3000):
+        try:
+            os.kill(pid, 0)
+            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")")[-1].split()[0]
+        except (ProcessLookupError, FileNotFoundError):
+            return True
+        if state == "Z":
+            return True
+        select.select([], [], [], 0.01)
+    return False
 
 
 def entities(path) -> set[str]:
@@ -221,6 +247,65 @@ def test_the_run_is_told_of_a_fault_in_the_writer(tmp_path, monkeypatch):
     recorder.after("mtpcr.bev", "bev", {}, None, 0.1)
     with pytest.raises(ZeroDivisionError, match="planted"):
         recorder.close()
+
+
+def test_a_process_of_its_own_records_the_same(tmp_path):
+    pair = make_pair(800)
+    # a matcher may hold what cannot be sent
+    pair = pair.with_(matches=dataclasses.replace(pair.matches, matcher=lambda: None))
+    record(tmp_path / "a.rrd", pair)
+    record(tmp_path / "b.rrd", pair, apart=True)
+    assert entities(tmp_path / "a.rrd") == entities(tmp_path / "b.rrd")
+    for entity in sorted(entities(tmp_path / "a.rrd")):
+        if not entity.startswith("/__"):
+            assert rows_without_ids(tmp_path / "a.rrd", entity) == rows_without_ids(
+                tmp_path / "b.rrd", entity
+            )
+
+
+def test_a_fault_in_the_other_process_reaches_the_run(tmp_path):
+    recorder = RerunRecorder(tmp_path / "a.rrd", apart=True)
+    recorder.begin({})
+    recorder.after("mtpcr.bev", "bev", {}, None, "no number")
+    recorder.after("mtpcr.bev", "bev", {}, None, 0.1)
+    with pytest.raises(ValueError, match="format code"):
+        recorder.close()
+    assert not (tmp_path / "a.rrd").exists()
+
+
+def test_the_other_process_ends_without_a_recording(tmp_path):
+    recorder = RerunRecorder(tmp_path / "a.rrd", apart=True)
+    recorder.begin({})
+    wait([recorder._jobs[0]])
+    recorder._writer._process.kill()
+    with pytest.raises(OutputError, match="the process that makes it ended with"):
+        recorder.close()
+
+
+def test_an_unwritable_place_is_our_error_from_another_process_too(tmp_path):
+    recorder = RerunRecorder(tmp_path / "no" / "a.rrd", apart=True)
+    recorder.begin({})
+    with pytest.raises(OutputError, match="cannot write the recording"):
+        recorder.close()
+
+
+def test_the_other_process_ends_with_the_run(tmp_path):
+    code = (
+        "import sys, os; from mtpcr_geo.export.recording.recorder import RerunRecorder;"
+        "recorder = RerunRecorder(sys.argv[1], apart=True); recorder.begin({});"
+        "[job.result() for job in recorder._jobs]; print(recorder._writer._process.pid, flush=True);"
+        "os._exit(9)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "a.rrd"],
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 9
+    assert not (tmp_path / "a.rrd").exists()
+    assert ended(int(done.stdout))
 
 
 def test_importing_the_recorder_does_not_import_rerun():

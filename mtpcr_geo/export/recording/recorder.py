@@ -1,17 +1,19 @@
 """The recording: what every stage took and made, as a file for the rerun viewer.
 
-Everything that is drawn is written by one worker thread while the run goes on: the values that stages
-hand on never change, so nothing has to be copied and the run hardly waits.
+One worker thread draws while the run goes on, or hands what is drawn to a process of its own: the values
+that stages hand on never change, so nothing has to be copied and the run hardly waits.
 """
 
 from __future__ import annotations
 
 import os
+import sys
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from mtpcr_geo.core.errors import OutputError
+from mtpcr_geo.core.system import command_line, usable_cores
 from mtpcr_geo.export.recording.budget import Budget
 
 
@@ -25,14 +27,23 @@ class RerunRecorder:
         path: the file to write; renamed by the caller once the run is whole.
         budget: how large the file may become: points are thinned by a seeded choice, pictures shrunk.
         seed: of the thinning.
+        apart: draw in a process of its own, which takes more processor time and less of the run's; by
+            default where this process is a command with more than one core, which has not drawn yet.
 
     Raises:
         OutputError: from `close`, if the file could not be written.
 
     """
 
-    def __init__(self, path: str | os.PathLike[str], budget: Budget | None = None, seed: int = 0) -> None:
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        budget: Budget | None = None,
+        seed: int = 0,
+        apart: bool | None = None,
+    ) -> None:
         self.path = Path(path)
+        self.apart = _pays_apart() if apart is None else apart
         self.budget = budget or Budget()
         self._worker: ThreadPoolExecutor | None = ThreadPoolExecutor(1, thread_name_prefix="recording")
         self._jobs: list[Future[None]] = []
@@ -76,6 +87,14 @@ class RerunRecorder:
         self._jobs.append(self._worker.submit(job, *arguments))
 
     def _open(self, budget: Budget, seed: int) -> None:
+        if self.apart:
+            from mtpcr_geo.export.recording.apart import RemoteWriter
+
+            try:
+                self._writer = RemoteWriter(self.path, budget, seed)
+                return
+            except OSError:  # no more processes are allowed
+                pass
         from mtpcr_geo.export.recording.writer import RecordingWriter
 
         self._writer = RecordingWriter(self.path, budget, seed)
@@ -83,3 +102,13 @@ class RerunRecorder:
     def _finish(self) -> None:
         if self._writer is not None:
             self._writer.close()
+
+
+def _pays_apart() -> bool:
+    """Return whether another process saves time: rerun is not imported here, and will not be needed again."""
+    global _opened
+    first, _opened = not _opened, True
+    return first and command_line() is not None and usable_cores() > 1 and "rerun" not in sys.modules
+
+
+_opened = False

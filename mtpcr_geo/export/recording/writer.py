@@ -104,7 +104,11 @@ class RecordingWriter:
         self._stage += 1
 
     def close(self) -> None:
-        """Send the layout and finish the file."""
+        """Finish the recording and write it."""
+        self._path.write_bytes(self.finished())
+
+    def finished(self) -> bytes:
+        """Send the layout and return the whole recording, as it stands in a file."""
         self._stream.log("run", self._markdown(self._run_text()), static=True)
         self._log_bars("time", ("stage", "seconds"), self._time_bars())
         trail = trail_json(self._properties, self._trail, self._pair, self._drawn())
@@ -114,7 +118,7 @@ class RecordingWriter:
         self._stream.send_blueprint(layout(self._recorded), make_active=True, make_default=True)
         data = self._memory.drain_as_bytes()
         self._stream.disconnect()
-        self._path.write_bytes(data)
+        return bytes(data)
 
     def _log_pair(self, pair: Pair) -> None:
         self._pair = pair
