@@ -1,4 +1,4 @@
-"""Iterative closest points on the overlap, and how well surfaces meet under a transform (small_gicp)."""
+"""Iterative closest points on the overlap, and how well surfaces meet under a transform."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import IcpMethod, IcpRound
 from mtpcr_geo.core.wording import only
 from mtpcr_geo.method.downsample import near, thinned
+from mtpcr_geo.method.gicp import Descender, Surface
 from mtpcr_geo.method.neighbourhoods import local_shapes
 from mtpcr_geo.method.overlap import overlap_of
 
-_SMALL_GICP_NAMES = {"gicp": "GICP", "point_to_plane": "PLANE_ICP", "point_to_point": "ICP"}
 FEWEST_POINTS = 200
 FAR_DISTANCES_M = (3.0, 1.5)
 NEAR_DISTANCES_M = (1.0, 0.5)
@@ -27,6 +27,8 @@ FINE_CELL_M = 2.0
 
 STILL_RAD = 4e-6
 STILL_M = 1e-4
+ROUGH_SLACK, ROUGH_PARTNERS = 25.0, 7_500
+"""For all rounds but the last: times the usual step at which they stand still, and partners that do."""
 NEIGHBOURS = 10
 FLAT = 4.0
 """Times that a flat neighbourhood spreads further along its surface than across it."""
@@ -153,8 +155,6 @@ class Surfaces:
     ) -> Descent:
         """Run ICP from a transform, in rounds of given correspondence distance.
 
-        The optimiser runs on one thread: sums over several would differ in their last bits from run to run.
-
         Args:
             T_from: 4x4 from source to target, work coordinates.
             rounds: correspondence distance of each round, and which points take part.
@@ -162,32 +162,26 @@ class Surfaces:
             iterations: at most, each round.
 
         """
-        import small_gicp
-
         X = self._relative(T_from)
         done: list[IcpRound] = []
         distances = rounds.max_correspondence_distances_m
-        trimmed = self._source if rounds.trim_m is None else self._trimmed(X, rounds.trim_m)
+        trimmed = None if rounds.trim_m is None else self._trimmed(X, rounds.trim_m)
         for number, distance in enumerate(distances, 1):
-            # what a round leaves is taken up by the next; only the last must stand still
+            # what a round leaves is taken up by the next; only the last must stand still, and take all points
             last = number == len(distances)
-            slack = rounds.slack if last else 25.0
-            result = small_gicp.align(
-                self._target,
-                self._source if last else trimmed,
-                self._tree,
+            slack = rounds.slack if last else ROUGH_SLACK
+            result = self._descender.descend(
                 X,
-                registration_type=_SMALL_GICP_NAMES[method],
-                max_correspondence_distance=distance,
-                num_threads=1,
-                max_iterations=iterations,
-                rotation_epsilon=slack * STILL_RAD,
-                translation_epsilon=slack * STILL_M,
+                within_m=distance,
+                method=method,
+                iterations=iterations,
+                still_rad=slack * STILL_RAD,
+                still_m=slack * STILL_M,
+                among=None if last else trimmed,
+                enough=None if last else ROUGH_PARTNERS,
             )
-            X = np.array(result.T_target_source)
-            done.append(
-                IcpRound(distance, int(result.iterations), int(result.num_inliers), bool(result.converged))
-            )
+            X = result.T
+            done.append(IcpRound(distance, result.iterations, result.inliers, result.converged))
         return Descent(self._absolute(X), tuple(done))
 
     def between(self, A: Floats, B: Floats) -> Floats:
@@ -254,17 +248,19 @@ class Surfaces:
         small_gicp.estimate_normals_covariances(cloud, tree, NEIGHBOURS, self._threads)
         return tree
 
-    def _trimmed(self, X: Floats, within_m: float) -> Any:
-        """Return the source's points that have a partner near by; all, where those are too few."""
-        import small_gicp
-
+    def _trimmed(self, X: Floats, within_m: float) -> Indices | None:
+        """Return the source's points that have a partner near by; None, for all, where those are too few."""
         squared = np.asarray(self._tree.batch_knn_search(transforms.apply(X, self._s), 1, self._threads)[1])
-        kept = squared[:, 0] <= within_m**2
-        if kept.sum() < FEWEST_POINTS:
-            return self._source
-        cloud = small_gicp.PointCloud(self._s[kept])
-        self._with_surfaces(cloud)
-        return cloud
+        kept = np.flatnonzero(squared[:, 0] <= within_m**2)
+        return None if len(kept) < FEWEST_POINTS else kept
+
+    @cached_property
+    def _descender(self) -> Descender:
+        source, target = (
+            Surface(points, np.asarray(cloud.normals())[:, :3])
+            for points, cloud in ((self._s, self._source), (self._t, self._target))
+        )
+        return Descender(source, target, self._tree)
 
     @cached_property
     def _probes(self) -> tuple[Floats, Floats]:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from concurrent.futures import wait
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -252,6 +253,7 @@ def test_the_run_is_told_of_a_fault_in_the_writer(tmp_path, monkeypatch):
 def test_a_process_of_its_own_records_the_same(tmp_path):
     pair = make_pair(800)
     # a matcher may hold what cannot be sent
+    assert pair.matches is not None
     pair = pair.with_(matches=dataclasses.replace(pair.matches, matcher=lambda: None))
     record(tmp_path / "a.rrd", pair)
     record(tmp_path / "b.rrd", pair, apart=True)
@@ -266,7 +268,8 @@ def test_a_process_of_its_own_records_the_same(tmp_path):
 def test_a_fault_in_the_other_process_reaches_the_run(tmp_path):
     recorder = RerunRecorder(tmp_path / "a.rrd", apart=True)
     recorder.begin({})
-    recorder.after("mtpcr.bev", "bev", {}, None, "no number")
+    no_number: Any = "no number"
+    recorder.after("mtpcr.bev", "bev", {}, None, no_number)
     recorder.after("mtpcr.bev", "bev", {}, None, 0.1)
     with pytest.raises(ValueError, match="format code"):
         recorder.close()
