@@ -1,4 +1,4 @@
-"""Generalised ICP: the optimum of small_gicp, remembered neighbours that are the nearest, known transforms."""
+"""Generalised ICP: the optimum of small_gicp, nearest neighbours remembered, known transforms."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_a_known_transform_comes_back(method, seed):
     _, tree, target = cloud_of(xyz)
     _, _, source = cloud_of(transforms.apply(transforms.inverse(T), xyz))
     found = Descender(source, target, tree).descend(
-        np.eye(4), within_m=2.0, method=method, iterations=100, still_rad=1e-9, still_m=1e-8
+        np.eye(4), within_m=2.0, method=method, iterations=500, still_rad=1e-9, still_m=1e-8
     )
     degrees, metres = apart(found.T, T)
     assert found.converged
