@@ -66,11 +66,12 @@ def hillshade(top: Image, cell: float) -> Picture:
     dx = np.gradient(z, cell, axis=1) if z.shape[1] > 1 else np.zeros_like(z)
     dy = -np.gradient(z, cell, axis=0) if z.shape[0] > 1 else np.zeros_like(z)  # rows run south
     light = np.zeros(top.shape, np.float32)
+    steepness = np.sqrt(1.0 + dx**2 + dy**2)
     for azimuth, weight in ((315.0, 0.6), (270.0, 0.2), (0.0, 0.2)):
         a, h = np.deg2rad(azimuth), np.deg2rad(45.0)
-        sun = np.array([np.sin(a) * np.cos(h), np.cos(a) * np.cos(h), np.sin(h)])
-        shade = (sun[2] - dx * sun[0] - dy * sun[1]) / np.sqrt(1.0 + dx**2 + dy**2)
-        light += weight * np.clip(shade, 0.0, 1.0).astype(np.float32)
+        sun = np.array([np.sin(a) * np.cos(h), np.cos(a) * np.cos(h), np.sin(h)], np.float32)
+        shade = (sun[2] - dx * sun[0] - dy * sun[1]) / steepness
+        light += np.float32(weight) * np.clip(shade, 0.0, 1.0)
     return np.where(filled, np.clip(1.0 + 254.0 * light, 1, 255), 0).astype(np.uint8)
 
 
@@ -311,12 +312,18 @@ def _rgb(picture: Picture) -> Picture:
     return np.repeat(picture[..., None], 3, axis=2) if picture.ndim == 2 else picture
 
 
+def middle_height(top: Image, filled: Mask) -> np.float32:
+    """Return a height about which filled cells lie, of some thousand of them; 0 where there are none."""
+    known = top[filled]
+    return np.float32(np.median(known[:: max(1, len(known) // 20_000)]) if len(known) else 0.0)
+
+
 def _masked_blur(top: Image, filled: Mask, sigma: float, fill: bool = False) -> Image:
     """Return a Gaussian mean of filled cells; with `fill` empty cells take their neighbourhood's mean."""
     import cv2
 
-    middle = np.float32(np.median(top[filled])) if filled.any() else np.float32(0.0)
-    z = np.where(filled, top - middle, 0.0).astype(np.float32)
+    middle = middle_height(top, filled)
+    z = np.where(filled, top - middle, np.float32(0.0))
     weight = filled.astype(np.float32)
     total = cv2.GaussianBlur(z, (0, 0), sigma)
     share = cv2.GaussianBlur(weight, (0, 0), sigma)
@@ -328,11 +335,11 @@ def _masked_blur(top: Image, filled: Mask, sigma: float, fill: bool = False) -> 
 
 
 def _masked_mean(top: Image, filled: Mask, size: int) -> Image:
-    """Return the mean of filled cells in a square of `size` cells; the overall median where it has none."""
+    """Return the mean of filled cells in a square of `size` cells; a middle height where it has none."""
     import cv2
 
-    middle = np.float32(np.median(top[filled])) if filled.any() else np.float32(0.0)
-    z = np.where(filled, top - middle, 0.0).astype(np.float32)
+    middle = middle_height(top, filled)
+    z = np.where(filled, top - middle, np.float32(0.0))
     total = cv2.boxFilter(z, -1, (size, size), normalize=False, borderType=cv2.BORDER_CONSTANT)
     number = cv2.boxFilter(
         filled.astype(np.float32), -1, (size, size), normalize=False, borderType=cv2.BORDER_CONSTANT

@@ -46,6 +46,7 @@ ALIASES = {
 """What a GIS shows for each field of the layers."""
 
 _FOOTPRINT_POINTS = 40_000
+_AT_A_TIME = 256
 _PLACED_POINTS = 4_000
 _ARROW_SHARE = 0.02
 _ROUND = (1.0, 2.0, 5.0)
@@ -262,9 +263,12 @@ def _spacing(plan: Floats, score: Floats, agrees: NDArray[np.bool_]) -> Floats:
     for kind in (True, False):
         order = np.flatnonzero(np.asarray(agrees, bool) == kind)
         order = order[np.argsort(-score[order], kind="stable")]
-        for place in range(1, len(order)):
-            apart = plan[order[:place]] - plan[order[place]]
-            spacing[order[place]] = np.sqrt((apart**2).sum(axis=1).min())
+        x, y = plan[order].T
+        for start in range(1, len(order), _AT_A_TIME):
+            some = np.arange(start, min(start + _AT_A_TIME, len(order)))
+            squared = (x[some, None] - x[: some[-1]]) ** 2 + (y[some, None] - y[: some[-1]]) ** 2
+            squared[np.arange(some[-1]) >= some[:, None]] = np.inf
+            spacing[order[some]] = np.sqrt(squared.min(axis=1))
     return spacing
 
 

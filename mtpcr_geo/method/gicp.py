@@ -21,6 +21,7 @@ ALONG_NORMAL = 1e-3
 """Variance of a surface along its normal, as a share of that across it (the paper's epsilon)."""
 FEWEST_PARTNERS = 6
 _HAIR_M = 1e-9  # rounding could tip what is nearly halfway
+_ROUNDING = 1e-12  # of a sum: by so much a step that improves nothing may seem to worsen it
 DAMPING, DAMPING_FACTOR, MOST_TRIES = 1e-3, 10.0, 10
 """Damping of Levenberg and Marquardt's step at first, by what it changes, and how often it is raised."""
 
@@ -134,7 +135,7 @@ class Descender:
     """
 
     def __init__(self, source: Surface, target: Surface, tree: Any) -> None:
-        self._source, self._target, self._tree = source, target, tree
+        self.source, self.target, self._tree = source, target, tree
 
     def descend(
         self,
@@ -160,14 +161,14 @@ class Descender:
             enough: partners that do at the start: of more, every so many points are left out; None uses all.
 
         """
-        points, normals = self._source.points, self._source.normals
+        points, normals = self.source.points, self.source.normals
         if among is not None:
             points, normals = points[among], normals[among]
-        partners = Partners(self._tree, self._target.points, points, within_m)
+        partners = Partners(self._tree, self.target.points, points, within_m)
         every = 1 if enough is None else len(partners.of(T)[0]) // enough
         if every > 1:
             points, normals = points[::every], normals[::every]
-            partners = Partners(self._tree, self._target.points, points, within_m)
+            partners = Partners(self._tree, self.target.points, points, within_m)
         damping, inliers = DAMPING, 0
         for number in range(1, iterations + 1):
             near, places, partner = partners.of(T)
@@ -175,14 +176,14 @@ class Descender:
             if inliers < FEWEST_PARTNERS:
                 return Descended(T, number, inliers, converged=False)
             places = np.ascontiguousarray(places.T)
-            gap = np.ascontiguousarray(self._target.points[partner].T) - places
-            weighing = _weighing(method, T[:3, :3] @ normals[near].T, self._target.normals[partner].T)
-            H, b = weighing.equations(places, gap)
-            cost = weighing.cost(gap)
+            gap = np.ascontiguousarray(self.target.points[partner].T) - places
+            weights = weighing(method, T[:3, :3] @ normals[near].T, self.target.normals[partner].T)
+            H, b = weights.equations(places, gap)
+            most = weights.cost(gap) * (1.0 + _ROUNDING)
             for _ in range(MOST_TRIES):
                 step = np.asarray(np.linalg.solve(H + damping * np.eye(6), b), np.float64)
                 change = _exponential(step)
-                if weighing.cost(gap + places - _moved(change, places)) <= cost:
+                if weights.cost(gap + places - _moved(change, places)) <= most:
                     break
                 damping *= DAMPING_FACTOR
             else:
@@ -219,6 +220,14 @@ class Weighing:
             total += float(np.einsum("n,n,n->", strength, along, along))
         return total
 
+    def matrices(self) -> Floats:
+        """Return the information of each gap, (n, 3, 3); there must be a direction."""
+        of_each = [
+            np.einsum("n,in,jn->nij", strength, direction, direction)
+            for direction, strength in zip(self.directions, self.strengths, strict=True)
+        ]
+        return np.asarray(self.even * np.eye(3) + sum(of_each))
+
     def equations(self, places: Floats, gap: Floats) -> tuple[Floats, Floats]:
         """Return the normal equations of a small rotation and shift, (6, 6) and (6,).
 
@@ -250,7 +259,7 @@ class Weighing:
         return H, b
 
 
-def _weighing(method: IcpMethod, of_source: Floats, of_target: Floats) -> Weighing:
+def weighing(method: IcpMethod, of_source: Floats, of_target: Floats) -> Weighing:
     """Return how gaps between surfaces weigh, from their normals in one frame, (3, n) each.
 
     Each surface spreads by 1 across its normal and by `ALONG_NORMAL` along it; the information is the inverse

@@ -15,7 +15,7 @@ from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import IcpMethod, IcpRound
 from mtpcr_geo.core.wording import only
 from mtpcr_geo.method.downsample import near, thinned
-from mtpcr_geo.method.gicp import Descender, Surface
+from mtpcr_geo.method.gicp import Descender, Surface, weighing
 from mtpcr_geo.method.neighbourhoods import local_shapes
 from mtpcr_geo.method.overlap import overlap_of
 
@@ -208,12 +208,6 @@ class Surfaces:
         gap = np.einsum("ij,ij->i", normal, self._t[nearest] - moved)
         return float((gap**2 / (gap**2 + MEETS_M**2)).mean())
 
-    @cached_property
-    def _covariances(self) -> tuple[Floats, Floats]:
-        """Covariances that GICP gives the points of source and target, (n, 3, 3) and (m, 3, 3)."""
-        source, target = (np.asarray(cloud.covs())[:, :3, :3] for cloud in (self._source, self._target))
-        return source, target
-
     @property
     def pivot(self) -> Floats:
         """Origin near the middle of the overlap, (3,) target work coordinates, metres."""
@@ -235,10 +229,9 @@ class Surfaces:
         near_by = np.asarray(squared)[:, 0] <= within_m**2
         chosen, moved = chosen[near_by], moved[near_by]
         partner = np.asarray(nearest)[near_by, 0].astype(np.int64)
-        R = X[:3, :3]
-        of_source, of_target = self._covariances
-        spread = R @ of_source[chosen] @ R.T + of_target[partner]
-        return Correspondences(chosen, moved, self._t[partner] - moved, np.linalg.inv(spread))
+        of_source = self._descender.source.normals[chosen] @ X[:3, :3].T
+        weight = weighing("gicp", of_source.T, self._descender.target.normals[partner].T).matrices()
+        return Correspondences(chosen, moved, self._t[partner] - moved, weight)
 
     def _with_surfaces(self, cloud: Any) -> Any:
         """Find a cloud's normals and covariances, which are stored in it, and give its tree."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.grid import Grid
+from mtpcr_geo.core.groups import Groups
 from mtpcr_geo.core.types import Bev
 from mtpcr_geo.method.bev import grid_around, rasterise
 
@@ -57,19 +58,13 @@ class CommonGround:
         side = min(np.sqrt(len(self.xy) / BLOCKS) * self.cell, LARGEST_BLOCK_M)
         side = float(max(side, np.sqrt(2.0 * FEWEST_IN_BLOCK) * self.cell))
         column, row = np.floor(self.xy / side).astype(np.int64).T
-        _, number = np.unique(np.column_stack([column, row]), axis=0, return_inverse=True)
-        order = np.argsort(number.ravel(), kind="stable")
-        starts = np.flatnonzero(np.diff(number.ravel()[order], prepend=-1))
-        parts = [part for part in np.split(order, starts[1:]) if len(part) >= FEWEST_IN_BLOCK]
-        if len(parts) < FEWEST_BLOCKS:
-            return GroundShape(len(parts), np.inf, 0.0)
-        xy = np.array([self.xy[part].mean(axis=0) for part in parts])
-        step = np.array([np.median(self.step[part]) for part in parts])
-        reliefs = [
-            _robust_spread(_without_plane(xy, np.array([np.median(z[part]) for part in parts])))
-            for z in (self.source, self.target)
-        ]
-        return GroundShape(len(parts), _robust_spread(step), float(np.sqrt(np.mean(np.square(reliefs)))))
+        groups = Groups.of(column, row, FEWEST_IN_BLOCK)
+        if len(groups) < FEWEST_BLOCKS:
+            return GroundShape(len(groups), np.inf, 0.0)
+        xy = np.column_stack([groups.means(axis) for axis in self.xy.T])
+        reliefs = [_robust_spread(_without_plane(xy, groups.medians(z))) for z in (self.source, self.target)]
+        spread = _robust_spread(groups.medians(self.step))
+        return GroundShape(len(groups), spread, float(np.sqrt(np.mean(np.square(reliefs)))))
 
 
 @dataclass(frozen=True)

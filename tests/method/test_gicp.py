@@ -8,7 +8,7 @@ import small_gicp
 from scipy.spatial import cKDTree
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.method.gicp import Descender, Partners, Surface, Weighing, _weighing
+from mtpcr_geo.method.gicp import Descender, Partners, Surface, Weighing, weighing
 
 # its point-to-plane weighs the axes one by one, and ends elsewhere
 METHODS = {"gicp": "GICP", "point_to_point": "ICP"}
@@ -129,20 +129,21 @@ def test_the_weights_are_the_inverse_of_both_covariances():
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     normals[1, :, :3] = normals[0, :, :3] * [1.0, -1.0, 1.0]
     gap, places = rng.normal(size=(3, 50)), rng.normal(size=(3, 50)) * 20.0
-    weighing: Weighing = _weighing("gicp", normals[0], normals[1])
+    weights: Weighing = weighing("gicp", normals[0], normals[1])
     flat = [
         np.eye(3) - (1.0 - 1e-3) * np.einsum("i,j->ij", *(one[:, n],) * 2)
         for n in range(50)
         for one in normals
     ]
     information = np.linalg.inv([flat[2 * n] + flat[2 * n + 1] for n in range(50)])
-    assert weighing.cost(gap) == pytest.approx(np.einsum("in,nij,jn->", gap, information, gap))
+    assert weights.cost(gap) == pytest.approx(np.einsum("in,nij,jn->", gap, information, gap))
+    np.testing.assert_allclose(weights.matrices(), information, rtol=1e-9, atol=1e-9)
     # a shift and a turn change the gap by -J of them
     J = np.stack(
         [np.cross(axis, places.T) for axis in np.eye(3)]
         + [np.broadcast_to(axis, (50, 3)) for axis in np.eye(3)],
         axis=2,
     )
-    H, b = weighing.equations(places, gap)
+    H, b = weights.equations(places, gap)
     np.testing.assert_allclose(H, np.einsum("nik,nij,njl->kl", J, information, J), rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(b, np.einsum("nik,nij,jn->k", J, information, gap), rtol=1e-9, atol=1e-6)

@@ -163,42 +163,48 @@ def heights_of_both(source: Image, target: Image) -> drawing.Picture:
     """
     low, high, plane = _stretch(source, target)
     seen = [np.isfinite(top) for top in (source, target)]
+    scale = np.float32(0.88 / (high - low))
     light = [
-        np.where(one, 0.12 + 0.88 * np.clip((top - plane - low) / (high - low), 0.0, 1.0), 0.0)[..., None]
+        np.where(one, np.float32(0.12) + np.clip((top - plane - low) * scale, 0.0, np.float32(0.88)), 0.0)
         for one, top in zip(seen, (source, target), strict=True)
     ]
     orange = np.array(drawing.SOURCE_RGB, np.float64)
     orange *= 255.0 / orange.max()
     hues = orange, 255.0 - orange
-    mixed = light[0] * hues[0] + light[1] * hues[1]
-    for one, other, hue, share in ((*seen, hues[0], light[0]), (*seen[::-1], hues[1], light[1])):
-        # what one of them alone sees says nothing of the fit
-        dim = _ALONE * share * (0.75 * 255.0 + 0.25 * hue)
-        mixed = np.where((one & ~other)[..., None], 20.0 + dim, mixed)
-    alpha = np.where(seen[0] | seen[1], 255, 0)
-    return np.dstack([np.clip(mixed, 0, 255), alpha]).astype(np.uint8)
+    # what one of them alone sees says nothing of the fit
+    alone = [one & ~other for one, other in (seen, seen[::-1])]
+    out = np.empty((*source.shape, 4), np.uint8)
+    for k in range(3):
+        mixed = light[0] * np.float32(hues[0][k]) + light[1] * np.float32(hues[1][k])
+        for one, hue, share in zip(alone, hues, light, strict=True):
+            dim = np.float32(_ALONE * (0.75 * 255.0 + 0.25 * hue[k]))
+            mixed = np.where(one, np.float32(20.0) + dim * share, mixed)
+        out[..., k] = np.clip(mixed, 0, 255)
+    out[..., 3] = np.where(seen[0] | seen[1], 255, 0)
+    return out
 
 
-def _stretch(source: Image, target: Image) -> tuple[float, float, Floats]:
+def _stretch(source: Image, target: Image) -> tuple[float, float, Image]:
     """Return the least and greatest height that are told apart, and the plane from which they count."""
-    rows, columns = (np.asarray(one, np.float64) for one in np.indices(source.shape))
     both = np.isfinite(source) & np.isfinite(target)
-    seen = both if both.any() else np.isfinite(source) | np.isfinite(target)
-    if not seen.any():
-        return 0.0, 1.0, np.zeros(source.shape)
-    z = np.where(np.isfinite(target), target, source)[seen].astype(np.float64)
-    A = np.column_stack([np.ones(len(z)), rows[seen], columns[seen]])
-    step = max(1, len(z) // 20_000)
+    seen = np.flatnonzero(both if both.any() else np.isfinite(source) | np.isfinite(target))
+    if not len(seen):
+        return 0.0, 1.0, np.zeros(source.shape, np.float32)
+    seen = seen[:: max(1, len(seen) // 20_000)]
+    z = np.where(np.isfinite(target.flat[seen]), target.flat[seen], source.flat[seen]).astype(np.float64)
+    row, column = np.divmod(seen, source.shape[1])
+    A = np.column_stack([np.ones(len(z)), row, column])
     x: Floats = np.zeros(3)
-    weight: Floats = np.ones(len(z[::step]))
+    weight: Floats = np.ones(len(z))
     for _ in range(4):  # the ground, not what stands on it
-        x = np.asarray(np.linalg.lstsq(A[::step] * weight[:, None], z[::step] * weight, rcond=None)[0])
-        left = z[::step] - A[::step] @ x
+        x = np.asarray(np.linalg.lstsq(A * weight[:, None], z * weight, rcond=None)[0])
+        left = z - A @ x
         scale = max(1.4826 * float(np.median(np.abs(left))), 1e-3)
         weight = np.asarray(np.where(left > 0, 1.0 / (1.0 + (left / scale) ** 2), 1.0), np.float64)
-    plane = x[0] + x[1] * rows + x[2] * columns
-    low, high = np.percentile((z - plane[seen])[::step], [2.0, 98.0])
-    return float(low), float(max(high, low + 0.5)), np.asarray(plane)
+    rows, columns = (np.arange(size) for size in source.shape)
+    plane = (x[0] + x[1] * rows[:, None] + x[2] * columns).astype(np.float32)
+    low, high = np.percentile(z - A @ x, [2.0, 98.0])
+    return float(low), float(max(high, low + 0.5)), plane
 
 
 def difference_colours(difference: Image, most: float) -> drawing.Picture:
@@ -280,10 +286,16 @@ def before_and_after(pair: Pair) -> Swipe:
     ground = closed(warp_bev(target, np.eye(4), grid).top)
     factor = max(1, _WIDE_PX // max(grid.shape))
     ground = smooth_larger(ground, factor)
+    seen = np.isfinite(ground)
+    base = np.where(
+        seen,
+        np.float32(0.75) * drawing.hillshade(ground, cell / factor) + np.float32(20.0),
+        np.float32(130.0),
+    )
     pictures = []
     for T in (before, after):
         over = smooth_larger(closed(warp_bev(source, T, grid).top), factor)
-        pictures.append(_laid_over(over, ground, cell / factor))
+        pictures.append(_laid_over(over, base, seen, cell / factor))
     return Swipe(pictures[0], pictures[1], cell / factor, as_it_lay)
 
 
@@ -312,17 +324,24 @@ def _ends(grid: Grid) -> tuple[tuple[float, float], tuple[float, float]]:
     )
 
 
-def _laid_over(over: Image, ground: Image, cell: float) -> drawing.Picture:
-    """Return the source in orange over the target in grey, where it is seen through it."""
-    base = drawing.hillshade(ground, cell).astype(np.float32)
-    base = np.where(np.isfinite(ground), 0.75 * base + 20.0, 130.0)
-    shade = drawing.hillshade(over, cell).astype(np.float32)[..., None] / 255.0
-    tint = (0.25 + 0.75 * shade) * np.array((255, 150, 60), np.float32)
-    out = np.repeat(base[..., None], 3, axis=2)
-    seen = np.isfinite(over)[..., None]
-    out = np.where(seen, 0.15 * out + 0.85 * tint, out)
-    alpha = np.where(np.isfinite(over) | np.isfinite(ground), 255, 0)
-    return np.dstack([np.clip(out, 0, 255), alpha]).astype(np.uint8)
+def _laid_over(over: Image, base: Image, ground: Mask, cell: float) -> drawing.Picture:
+    """Return the source in orange over the target in grey, where it is seen through it.
+
+    Args:
+        over: (h, w) heights of the source, metres, NaN where empty.
+        base: (h, w) grey of the target.
+        ground: (h, w) where the target is seen.
+        cell: metres of a pixel.
+
+    """
+    seen = np.isfinite(over)
+    shade = drawing.hillshade(over, cell).astype(np.float32) / np.float32(255.0)
+    out = np.empty((*over.shape, 4), np.uint8)
+    for k, part in enumerate((255.0, 150.0, 60.0)):
+        tint = np.float32(0.85 * part) * (np.float32(0.25) + np.float32(0.75) * shade)
+        out[..., k] = np.clip(np.where(seen, np.float32(0.15) * base + tint, base), 0, 255)
+    out[..., 3] = np.where(seen | ground, 255, 0)
+    return out
 
 
 def relief(bev: Bev, side: int = _WIDE_PX) -> tuple[drawing.Picture, float]:

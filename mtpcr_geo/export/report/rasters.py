@@ -111,12 +111,10 @@ def smooth_larger(top: Image, factor: int) -> Image:
     if factor <= 1:
         return top
     filled = np.isfinite(top)
-    middle = np.float32(np.median(top[filled])) if filled.any() else np.float32(0)
+    middle = drawing.middle_height(top, filled)
     size = (top.shape[1] * factor, top.shape[0] * factor)
     weight = cv2.resize(filled.astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
-    total = cv2.resize(
-        np.where(filled, top - middle, 0).astype(np.float32), size, interpolation=cv2.INTER_CUBIC
-    )
+    total = cv2.resize(np.where(filled, top - middle, np.float32(0.0)), size, interpolation=cv2.INTER_CUBIC)
     z = np.full(weight.shape, np.nan, np.float32)
     held = weight > 0.5
     z[held] = total[held] / weight[held] + middle
