@@ -92,6 +92,7 @@ class Levelling(ComparesArrays):
         plane_to_verticals_deg: angle between the plane's normal and the vertical, degrees.
         floor_tilt_deg, floor_share: tilt of the sheet of lowest points, degrees, and share of the cells
             whose lowest point lies near it.
+        others: what the vertical may be instead, likeliest first; None where that was not looked for.
 
     """
 
@@ -107,10 +108,11 @@ class Levelling(ComparesArrays):
     plane_to_verticals_deg: float | None = None
     floor_tilt_deg: float | None = None
     floor_share: float | None = None
+    others: tuple[Levelling, ...] | None = None
 
     def audit(self) -> dict[str, Any]:
-        """Return everything but the matrix, without what is not known, for the audit."""
-        names = [one.name for one in fields(self) if one.name != "T_level_work"]
+        """Return everything but matrices, without what is not known, for the audit."""
+        names = [one.name for one in fields(self) if one.name not in ("T_level_work", "others")]
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
 

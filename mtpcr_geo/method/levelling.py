@@ -84,7 +84,8 @@ def level(xyz: Floats, mode: Mode, georeferenced: bool, seed: int = 0) -> Levell
         return _levelled(
             xyz, up, Levelling(method="plane", plane_tilt_deg=_tilt_deg(up), plane_inlier_share=share)
         )
-    return verticals(xyz, seed)[0]
+    first, *others = verticals(xyz, seed)
+    return replace(first, others=tuple(others))
 
 
 def verticals(xyz: Floats, seed: int = 0) -> list[Levelling]:

@@ -6,7 +6,7 @@ The matching of both clouds tells more, since under a wrong vertical they do not
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -117,7 +117,7 @@ def others(pair: Pair, seed: int) -> list[tuple[Levelling, Levelling]]:
     """
     known = (pair.source.levelling, pair.target.levelling)
     sources, targets = (
-        [side.levelling, *(one for one in verticals(side.sample, seed) if _may_be(side, one))]
+        [side.levelling, *(one for one in _others_of(side, seed) if _may_be(side, one))]
         for side in (pair.source, pair.target)
     )
     wanted: list[tuple[Levelling, Levelling]] = []
@@ -130,6 +130,11 @@ def others(pair: Pair, seed: int) -> list[tuple[Levelling, Levelling]]:
         if not any(_same(one, other) for other in found):
             found.append(one)
     return found[1:]
+
+
+def _others_of(side: Side, seed: int) -> Sequence[Levelling]:
+    known = side.levelling.others
+    return verticals(side.sample, seed) if known is None else known
 
 
 def _same(one: tuple[Levelling, Levelling], other: tuple[Levelling, Levelling]) -> bool:
