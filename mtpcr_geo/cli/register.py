@@ -8,6 +8,7 @@ from mtpcr_geo.cli.options import RegisterVerb
 from mtpcr_geo.cli.parameters import command_of
 from mtpcr_geo.cli.shared import end_with, progress_bars
 from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.imports import import_ahead
 from mtpcr_geo.pipeline.options import PriorOptions, RegisterOptions
 
 
@@ -25,7 +26,7 @@ def run(options: RegisterVerb) -> None:
         mtpcr-geo register ground.laz aerial.laz -o out --dump-pipeline > mine.json
 
     """
-    from mtpcr_geo.cli.summary import print_registration
+    from mtpcr_geo.cli.summary import SUMMARY_NEEDS, print_registration
     from mtpcr_geo.pipeline.grammar import dump
     from mtpcr_geo.registration import build_pipeline, read_options, register
     from mtpcr_geo.survey import is_survey
@@ -42,6 +43,8 @@ def run(options: RegisterVerb) -> None:
         typer.echo(dump(build_pipeline(options.source, options.target, options.out, read_options(given))))
         return
     with progress_bars(options.quiet) as progress:
+        if not (options.quiet or options.as_json):
+            import_ahead(SUMMARY_NEEDS)
         if in_survey:
             from mtpcr_geo.survey.register import register_in_survey
 

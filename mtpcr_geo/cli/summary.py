@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from mtpcr_geo.pipeline.runner import RunResult
     from mtpcr_geo.registration import Registration
 
+SUMMARY_NEEDS = ("rich.console", "rich.table")
+"""Modules that printing imports."""
 _COLOUR = {"accepted": "bold green", "doubtful": "bold yellow", "refused": "bold red"}
 _RESULT_FILES = {"registered": "the registered cloud", "transform": "the transform"}
 # metrics of the verdict shown without --verbose

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 
 from mtpcr_geo.core.system import usable_cores
 
@@ -28,3 +29,19 @@ def import_ahead(names: Iterable[str]) -> None:
         # the result is not asked for, and an exception is part of it
         worker.submit(importlib.import_module, name)
     worker.shutdown(wait=False)
+
+
+@contextmanager
+def without(name: str) -> Iterator[None]:
+    """Let a package be found missing meanwhile, by whatever imports it where it can do without.
+
+    One that is imported already stays.
+    """
+    if name in sys.modules:
+        yield
+        return
+    sys.modules[name] = None  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        del sys.modules[name]

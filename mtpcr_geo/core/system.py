@@ -106,14 +106,15 @@ class Meter:
         """Read all."""
         moved = _numbers_of("/proc/self/io")
         read, written = (moved.get(name) for name in ("rchar", "wchar"))
-        resident = _numbers_of("/proc/self/status").get("VmRSS")
+        memory = _numbers_of("/proc/self/status")
+        resident, peak = memory.get("VmRSS"), memory.get("VmHWM")
         return cls(
             time.perf_counter(),
             time.process_time(),
             None if read is None else read / 2**20,
             None if written is None else written / 2**20,
             None if resident is None else round(resident / 2**10, 1),
-            peak_memory_mb(),
+            peak_memory_mb() if peak is None else round(peak / 2**10, 1),
         )
 
     def since(self, before: Meter) -> dict[str, float | None]:

@@ -15,7 +15,7 @@ from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.pyramid import Level, Pyramid
 from mtpcr_geo.match.repetition import REPEATS, self_likeness
-from mtpcr_geo.match.search import GlobalSearch, Layer, distinct
+from mtpcr_geo.match.search import GlobalSearch, Layer, all_yaws, distinct
 from mtpcr_geo.match.terrain import FEWEST_CELLS as FEWEST_GROUND_CELLS
 from mtpcr_geo.match.terrain import Terrain, TerrainSearch, closest, place_on
 from mtpcr_geo.method.ground import bare
@@ -312,8 +312,7 @@ class Exploration:
         cell, prior = source.grid.cell, self.prior
         fewest = self.fewest(factor)
         step = self._yaw_step(source)
-        count = round(2 * np.pi / step)
-        yaws = np.arange(count) * (2 * np.pi / count)
+        yaws = all_yaws(step)
         reached = target if prior is None else prior.layer(source.grid, target)
         if reached is None:
             return []

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo.core.arrays import Image
+from mtpcr_geo.core.arrays import Floats, Image
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.match.pose import Pose, centre_of, source_from_target_pixels, warp, warp_to
@@ -27,6 +27,7 @@ STEP_FLOOR = 0.02
 """Standard deviations below which an image shows nothing but noise: they bound the denominators."""
 FILLED = 0.5
 """Share of a turned cell that must come from filled cells for it to count as filled."""
+_SAME_YAW = 1e-9
 SPECTRAL_WINDOW = 5
 """Shifts to either side from which a window is scored in the frequency domain."""
 
@@ -136,24 +137,51 @@ class GlobalSearch:
 
     def scores(self, yaw: float) -> tuple[Image, Image]:
         """Score every shift under one yaw: scores and overlapping cells, both over cyclic shifts."""
-        turned, _ = self._turned(yaw)
-        a, e, m, aa, ee = self._spectra(turned)
+        return self._scores(yaw, self._spectra(self._turned(yaw)[0]))
+
+    def _scores(self, yaw: float, spectra: list[Image], opposite: bool = False) -> tuple[Image, Image]:
+        """Score every shift under one yaw.
+
+        Args:
+            yaw: the yaw, radians.
+            spectra: of the source turned to it, or half a turn from it.
+            opposite: whether it is half a turn from it: the image is then the same, both axes reversed, and
+                its spectrum the conjugate but for a shift.
+
+        """
+        a, e, m, aa, ee = spectra
         A, E, M, AA, EE = self._target_spectra
         pairs = ((M, m), (A, a), (E, e), (M, aa), (M, ee), (AA, m), (EE, m))
         overlap, pa, pe, sa, se, ta, te = (
-            cv2.idft(cv2.mulSpectrums(t, s, 0, conjB=True), flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)
+            cv2.idft(cv2.mulSpectrums(t, s, 0, conjB=not opposite), flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)
             for t, s in pairs
         )
         score = correlation_score(overlap, (pa, pe), (sa, se), (ta, te))
+        if opposite:
+            back = (1 - self._turned_side, 1 - self._turned_side)
+            score, overlap = (np.roll(image, back, axis=(0, 1)) for image in (score, overlap))
         left_out = overlap < self.min_overlap
         if self._allowed is not None:
             left_out |= ~self._allowed(yaw)
         np.putmask(score, left_out, -np.inf)
         return score, overlap
 
-    def peaks(self, yaw: float, count: int, apart_cells: int) -> list[Pose]:
-        """Find the best shifts under one yaw, at least ``apart_cells`` from each other."""
-        score, overlap = self.scores(yaw)
+    def peaks(self, yaws: tuple[float, ...], count: int, apart_cells: int) -> list[Pose]:
+        """Find the best shifts under a yaw, and under one half a turn from it, if there is a second.
+
+        Args:
+            yaws: one or two, radians.
+            count: shifts of each at most.
+            apart_cells: least distance of two of them, cells.
+
+        """
+        spectra = self._spectra(self._turned(yaws[0])[0])
+        found: list[Pose] = []
+        for number, yaw in enumerate(yaws):
+            found += self._peaks(yaw, *self._scores(yaw, spectra, opposite=number == 1), count, apart_cells)
+        return found
+
+    def _peaks(self, yaw: float, score: Image, overlap: Image, count: int, apart_cells: int) -> list[Pose]:
         rows, columns = self._shape
         found = []
         for _ in range(count):
@@ -180,13 +208,32 @@ class GlobalSearch:
     def run(
         self, yaws: Iterable[float], per_yaw: int, apart_cells: int, advance: Callable[[int], object]
     ) -> list[Pose]:
-        """Search all yaws; best first. ``advance`` is called with 1 after each yaw."""
+        """Search all yaws; best first. ``advance`` is called with the number of yaws as they are done."""
         poses: list[Pose] = []
+        paired = pairs_of_opposite(yaws)
         with ThreadPoolExecutor(self.workers) as pool:
-            for found in pool.map(lambda yaw: self.peaks(yaw, per_yaw, apart_cells), yaws):
-                poses += found
-                advance(1)
+            found = pool.map(lambda yaws: self.peaks(yaws, per_yaw, apart_cells), paired)
+            for these, of_these in zip(paired, found, strict=True):
+                poses += of_these
+                advance(len(these))
         return sorted(poses, key=lambda pose: -pose.score)
+
+
+def all_yaws(step: float) -> Floats:
+    """Return yaws round the circle, about ``step`` radians apart, each with its opposite."""
+    count = 2 * max(1, round(np.pi / step))
+    return np.asarray(np.arange(count) * (2 * np.pi / count), np.float64)
+
+
+def pairs_of_opposite(yaws: Iterable[float]) -> list[tuple[float, ...]]:
+    """Put yaws half a turn from each other together, each once, in their order; others stand alone."""
+    left = list(yaws)
+    paired: list[tuple[float, ...]] = []
+    while left:
+        one = left.pop(0)
+        other = next((k for k, yaw in enumerate(left) if angle_between(yaw, one + np.pi) < _SAME_YAW), None)
+        paired.append((one,) if other is None else (one, left.pop(other)))
+    return paired
 
 
 def spectrum(image: Image, shape: tuple[int, int]) -> Image:

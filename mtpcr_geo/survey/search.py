@@ -34,7 +34,7 @@ from mtpcr_geo.match.judge import CLEAR_MARGIN, Judge
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.pyramid import COARSEST_SEARCH_M, LARGEST_SEARCH, Pyramid
-from mtpcr_geo.match.search import GlobalSearch, Layer, distinct
+from mtpcr_geo.match.search import GlobalSearch, Layer, all_yaws, distinct
 from mtpcr_geo.match.terrain import Terrain
 from mtpcr_geo.method.bev import coarsen
 from mtpcr_geo.method.ground import bare
@@ -279,7 +279,7 @@ class _Search:
         if reached is None:
             return []
         search = GlobalSearch(source, reached, self._fewest(source))
-        yaws = np.arange(round(2 * np.pi / step)) * (2 * np.pi / round(2 * np.pi / step))
+        yaws = all_yaws(step)
         if prior is not None:
             yaws = prior.yaws(step)
             place = prior.place_of(source.grid)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
 import sys
 import textwrap
 
@@ -43,3 +44,17 @@ def test_what_stages_need_can_be_imported():
     assert len(names) >= 8
     for name in names:
         importlib.import_module(name)
+
+
+def test_a_package_may_be_left_out():
+    code = (
+        "import sys; from mtpcr_geo.core.imports import without\n"
+        "with without('wave'):\n"
+        "    try: import wave\n"
+        "    except ModuleNotFoundError: print('missing')\n"
+        "import wave\n"
+        "with without('wave'): import wave as again\n"
+        "print(again is wave is sys.modules['wave'])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["missing", "True"]

@@ -11,7 +11,14 @@ from mtpcr_geo.match.correlation import CorrelationSettings, match
 from mtpcr_geo.match.patches import match_patches
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of, warp_to
 from mtpcr_geo.match.pyramid import search_factors
-from mtpcr_geo.match.search import GlobalSearch, Layer, angle_between, score_nearby
+from mtpcr_geo.match.search import (
+    GlobalSearch,
+    Layer,
+    all_yaws,
+    angle_between,
+    pairs_of_opposite,
+    score_nearby,
+)
 from mtpcr_geo.method.bev import grid_around, rasterise
 from mtpcr_geo.method.images import channels
 
@@ -74,6 +81,27 @@ def test_no_correlation_exceeds_one_even_at_small_overlap(scene: tuple[np.ndarra
     score, overlap = GlobalSearch(source, target, 4.0).scores(0.3)
     seen = np.isfinite(score)
     assert (score[seen] <= 2.0 * np.sqrt(np.maximum(overlap[seen], 1.0)) + 1e-3).all()
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, -2.9])
+def test_half_a_turn_is_scored_as_if_turned(scene: tuple[np.ndarray, np.ndarray], yaw: float) -> None:
+    source, target = (layer_of(bev_of(xyz, 4.0)) for xyz in scene)
+    search = GlobalSearch(source, target, 20.5)  # not at a whole number, which rounding may miss
+    spectra = search._spectra(search._turned(yaw)[0])
+    score, overlap = search._scores(yaw + np.pi, spectra, opposite=True)
+    wanted, wanted_overlap = search.scores(yaw + np.pi)
+    assert np.array_equal(np.isfinite(score), np.isfinite(wanted))
+    seen = np.isfinite(score)
+    assert np.allclose(score[seen], wanted[seen], atol=1e-3)
+    assert np.allclose(overlap, wanted_overlap, atol=1e-2)
+
+
+def test_yaws_are_searched_once_each_beside_their_opposite() -> None:
+    yaws = all_yaws(np.radians(7.0))
+    paired = pairs_of_opposite(yaws)
+    assert len(yaws) == 2 * len(paired) == 52
+    assert sorted(yaw for pair in paired for yaw in pair) == sorted(yaws)
+    assert pairs_of_opposite([0.1, 0.2, 0.1 - np.pi, 3.0]) == [(0.1, 0.1 - np.pi), (0.2,), (3.0,)]
 
 
 def test_poses_and_hypotheses_say_the_same() -> None:
