@@ -92,7 +92,7 @@ def test_half_a_turn_is_scored_as_if_turned(scene: tuple[np.ndarray, np.ndarray]
     wanted, wanted_overlap = search.scores(yaw + np.pi)
     assert np.array_equal(np.isfinite(score), np.isfinite(wanted))
     seen = np.isfinite(score)
-    assert np.allclose(score[seen], wanted[seen], atol=1e-3)
+    assert np.allclose(score[seen], wanted[seen], atol=0.01)
     assert np.allclose(overlap, wanted_overlap, atol=1e-2)
 
 
