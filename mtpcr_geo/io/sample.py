@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 BUDGET = 4_000_000
 FEWEST_POINTS = 100
+AMONG_SMALLEST = 1.25
 # a double still tells an eighth of a unit apart there, and the Moon is nearer in millimetres
 _LARGEST_COORDINATE = 1e15
 
@@ -215,12 +216,16 @@ def surface_chunks(
 
 
 class _Subset:
-    """Uniform random subset of a stream: the points with the smallest random keys, in stream order."""
+    """Uniform random subset of a stream: the points with the smallest random keys, in stream order.
+
+    Of a cloud more than a fifth of which is noise it may be smaller than the budget.
+    """
 
     def __init__(self, count: int, budget: int, seed: int) -> None:
         self.budget = budget
         self.rng = np.random.default_rng(seed) if count > budget else None
-        self.bound = 1.0
+        # what has a larger key is hardly ever among the smallest in the end
+        self.bound = min(1.0, AMONG_SMALLEST * budget / max(count, 1))
         room = min(count, budget + max(CHUNK_POINTS, budget // 4))
         self.points = np.empty((room, 3))
         self.keys = np.empty(room if self.rng is not None else 0)

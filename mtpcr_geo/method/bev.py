@@ -29,6 +29,9 @@ FINEST_EQ1_CELL_M, COARSEST_EQ1_CELL_M = 0.1, 20.0
 MAX_CELLS = 64_000_000
 """Cells beyond which a raster is refused: 0.8 GiB for the three bands."""
 
+BLOCK = 32_768
+"""Points that are brought onto a grid at a time."""
+
 OCCUPANCY_CELL_M = 2.0
 FINEST_AUTO_CELL_M = 0.25
 CELLS_PER_EXTENT = 200.0
@@ -81,6 +84,11 @@ class Rasteriser:
 
     def add(self, xyz: Floats) -> None:
         """Add (n, 3) points in the grid's metres."""
+        # block by block it takes less memory, and less time
+        for start in range(0, len(xyz), BLOCK):
+            self._add(xyz[start : start + BLOCK])
+
+    def _add(self, xyz: Floats) -> None:
         grid = self.grid
         column, row = grid.cells(xyz) if self.convention == "centre" else _cells_by_ceiling(grid, xyz)
         inside = grid.holds(column, row)

@@ -12,6 +12,8 @@ MAX_VOXELS = 30_000_000
 DENSE_VOXELS = 2.5
 """Mean points a voxel above which voxels give their mean point, and below which all points are taken."""
 
+_BLOCK = 131_072
+
 LATTICE_M = 0.00037
 """Shift of the voxels off whole millimetres, on which points of a LAS scale lie."""
 
@@ -34,12 +36,21 @@ def near(points: Floats, others: Floats, distance: float) -> Mask:
     low = np.minimum(low_p, low_o) - 2 * edge
     shape = np.floor(span / edge).astype(int) + 5
     filled = np.zeros(tuple(shape.tolist()), dtype=np.bool_)
-    filled[tuple(np.floor((others - low) / edge).astype(np.int64).T)] = True
+    for start in range(0, len(others), _BLOCK):
+        filled[_voxels(others[start : start + _BLOCK], low, edge)] = True
     for axis in range(3):
         # voxels beside a filled one along each axis in turn: all 26 neighbours in the end
         ahead, behind = np.roll(filled, 1, axis), np.roll(filled, -1, axis)
         filled = filled | ahead | behind
-    return np.asarray(filled[tuple(np.floor((points - low) / edge).astype(np.int64).T)])
+    found = np.empty(len(points), bool)
+    for start in range(0, len(points), _BLOCK):
+        part = slice(start, start + _BLOCK)
+        found[part] = filled[_voxels(points[part], low, edge)]
+    return found
+
+
+def _voxels(xyz: Floats, low: Floats, edge: float) -> tuple[NDArray[np.int64], ...]:
+    return tuple(np.floor((xyz - low) / edge).astype(np.int64).T)
 
 
 def thinned(xyz: Floats, number: NDArray[np.int64], voxel: float, max_points: int) -> Floats:

@@ -21,7 +21,6 @@ ALONG_NORMAL = 1e-3
 """Variance of a surface along its normal, as a share of that across it (the paper's epsilon)."""
 FEWEST_PARTNERS = 6
 _HAIR_M = 1e-9  # rounding could tip what is nearly halfway
-_ROUNDING = 1e-12  # of a sum: by so much a step that improves nothing may seem to worsen it
 DAMPING, DAMPING_FACTOR, MOST_TRIES = 1e-3, 10.0, 10
 """Damping of Levenberg and Marquardt's step at first, by what it changes, and how often it is raised."""
 
@@ -179,15 +178,15 @@ class Descender:
             gap = np.ascontiguousarray(self.target.points[partner].T) - places
             weights = weighing(method, T[:3, :3] @ normals[near].T, self.target.normals[partner].T)
             H, b = weights.equations(places, gap)
-            most = weights.cost(gap) * (1.0 + _ROUNDING)
+            cost = weights.cost(gap)
             for _ in range(MOST_TRIES):
                 step = np.asarray(np.linalg.solve(H + damping * np.eye(6), b), np.float64)
                 change = _exponential(step)
-                if weights.cost(gap + places - _moved(change, places)) <= most:
+                if weights.cost(gap + places - _moved(change, places)) <= cost:
                     break
                 damping *= DAMPING_FACTOR
-            else:
-                return Descended(T, number, inliers, converged=False)
+            else:  # however short, no step is better
+                return Descended(T, number, inliers, converged=True)
             damping /= DAMPING_FACTOR
             T = change @ T
             if np.linalg.norm(step[:3]) <= still_rad and np.linalg.norm(step[3:]) <= still_m:

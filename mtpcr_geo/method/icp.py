@@ -124,6 +124,8 @@ class Surfaces:
             s, t = moved[of_source], target[of_target]
             farthest = max_correspondence_distance_m
             of_source, of_target = of_source[near(s, t, farthest)], of_target[near(t, s, farthest)]
+            del s, t
+        del moved, overlap  # copies of whole clouds
         if min(len(of_source), len(of_target)) < FEWEST_POINTS:
             role = "source" if len(of_source) <= len(of_target) else "target"
             raise RegistrationError(

@@ -13,13 +13,17 @@ from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.groups import Groups
 from mtpcr_geo.core.types import Bev
-from mtpcr_geo.method.bev import grid_around, rasterise
+from mtpcr_geo.method.bev import BLOCK, grid_around, rasterise
 
 OVERLAP_CELL_M = 2.0
 LOW_RADIUS_M = 6.0
 LOW_ABOVE_M = 0.7
 SLOPE_RADIUS_M = 8.0
 GROUND_LAYER_M = 0.3
+GROUND_BLOCK = 262_144
+"""Points whose layer is told at a time: each time the whole grid is gone over."""
+MOST = 0.7
+"""Share of a cloud on a grid above which no second array is made of it."""
 STEEPEST = 1.0
 """Slope, rise over run, beyond which steps count as walls and not as ground."""
 BLOCKS, FEWEST_BLOCKS, FEWEST_IN_BLOCK = 100, 12, 4
@@ -93,7 +97,7 @@ class Overlap:
         grid: the common grid.
         source, target: their rasters.
         shared: (h, w) cells that both fill, or that lie within one cell of both.
-        points: both clouds, (n, 3) and (m, 3) metres.
+        points: of both clouds, (n, 3) and (m, 3) metres, what lies on the grid and hardly more.
 
     """
 
@@ -119,10 +123,12 @@ class Overlap:
 
     def select(self, xyz: Floats) -> Mask:
         """Return which (n, 3) points lie in the overlap."""
-        column, row = self.grid.cells(xyz)
-        inside = self.grid.holds(column, row)
         found = np.zeros(len(xyz), bool)
-        found[inside] = self.shared[row[inside], column[inside]]
+        for start in range(0, len(xyz), BLOCK):
+            near = start + self.grid.near(xyz[start : start + BLOCK])
+            column, row = self.grid.cells(xyz[near])
+            inside = self.grid.holds(column, row)
+            found[near[inside]] = self.shared[row[inside], column[inside]]
         return found
 
     def common_ground(self) -> CommonGround:
@@ -165,10 +171,17 @@ def overlap_of(
     (low_s, high_s), (low_t, high_t) = transforms.bounds(source), transforms.bounds(target)
     low, high = np.maximum(low_s, low_t) - 2 * cell, np.minimum(high_s, high_t) + 2 * cell
     grid = grid_around(low, np.maximum(high, low + cell), cell)
+    source, target = (_nearby(grid, xyz) for xyz in (source, target))
     s, t = rasterise([source], grid), rasterise([target], grid)
     window = np.ones((2 * margin_cells + 1, 2 * margin_cells + 1), np.uint8)
     near = [cv2.dilate((bev.count > 0).astype(np.uint8), window) > 0 for bev in (s, t)]
     return Overlap(grid, s, t, near[0] & near[1], (source, target))
+
+
+def _nearby(grid: Grid, xyz: Floats) -> Floats:
+    """Return what of (n, 3) points lies on a grid and hardly more; all, where that is most of them."""
+    near = grid.near(xyz)
+    return xyz if len(near) > MOST * len(xyz) else np.asarray(xyz[near])
 
 
 def _ground(xyz: Floats, bev: Bev) -> Floats:
@@ -177,16 +190,19 @@ def _ground(xyz: Floats, bev: Bev) -> Floats:
     The single lowest point lies the lower the denser and the noisier a cloud is; the mean of what lies
     little above it does not. On a slope the layer is as much thicker as the ground rises within the cell.
     """
-    grid = bev.grid
-    column, row = grid.cells(xyz)
-    inside = grid.holds(column, row)
-    cell, z = row[inside] * grid.width + column[inside], xyz[inside, 2]
-    low = bev.low.ravel()[cell]
-    thick = GROUND_LAYER_M + _slope(bev.low, grid.cell).ravel() * grid.cell
-    layer = z - low <= thick[cell]
+    grid, low = bev.grid, bev.low.ravel()
+    thick = (GROUND_LAYER_M + _slope(bev.low, grid.cell) * grid.cell).ravel()
     size = grid.width * grid.height
-    count = np.bincount(cell[layer], minlength=size)
-    total = np.bincount(cell[layer], (z - low)[layer], minlength=size)
+    count, total = np.zeros(size), np.zeros(size)
+    for start in range(0, len(xyz), GROUND_BLOCK):
+        some = xyz[start : start + GROUND_BLOCK]
+        column, row = grid.cells(some)
+        inside = grid.holds(column, row)
+        cell = row[inside] * grid.width + column[inside]
+        above = some[inside, 2] - low[cell]
+        layer = above <= thick[cell]
+        count += np.bincount(cell[layer], minlength=size)
+        total += np.bincount(cell[layer], above[layer], minlength=size)
     with np.errstate(invalid="ignore"):
         return np.asarray(bev.low.astype(np.float64) + (total / count).reshape(grid.shape))
 

@@ -89,6 +89,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
             if side.levelling.method == "none" and not side.levelling.trusted
         ),
     )
+    del moved  # as large as the source
     evidence, further = with_further(evidence, pair, overlap, ground, tie_points, agreeing)
     shift = T[:3, 3]
     offset = TransformChain.of(pair).vertical_offset_m

@@ -36,6 +36,7 @@ MOST_GIVING_WAY = 4.0
 SLID_SHARE = 0.5
 """Standard deviation in plan of a scene that repeats itself, as a share of how far the fit went from the tie
 points. Of 46 simulated ones that distance and the true error correlate by 0.92."""
+_BLOCK = 262_144
 FEWEST_TIE_POINTS = 8
 FEWEST_GROUND = 30
 
@@ -87,17 +88,28 @@ def uncertainty_of(pair: Pair, equations: BlockEquations, ground: CommonGround) 
         covariance = covariance + np.outer(slid, slid)
     if not np.isfinite(covariance).all():
         return None
-    moved = transforms.apply(T, pair.source.sample)
-    off = (moved - equations.pivot) @ R_level.T
     return Uncertainty(
         covariance=both @ covariance @ both.T,
         pivot=equations.pivot,
         R_level=R_level,
-        far=moved[int(np.argmax((off[:, :2] ** 2).sum(axis=1)))],
+        far=_farthest(pair.source.sample, T, equations.pivot, R_level),
         blocks=len(equations.H),
         correspondences=int(equations.counts.sum()),
         fitted=equations.fitted,
     )
+
+
+def _farthest(source: Floats, T: Floats, pivot: Floats, R_level: Floats) -> Floats:
+    """Return where the point of the source (n, 3) farthest in plan from a pivot comes to lie, (3,)."""
+    best, found = -1.0, pivot
+    for start in range(0, len(source), _BLOCK):
+        moved = transforms.apply(T, source[start : start + _BLOCK])
+        off = (moved - pivot) @ R_level[:2].T
+        squared = np.einsum("ij,ij->i", off, off)
+        k = int(np.argmax(squared))
+        if squared[k] > best:
+            best, found = float(squared[k]), moved[k]
+    return found
 
 
 def giving_way(equations: BlockEquations) -> float:
