@@ -58,6 +58,15 @@ def benchmark(
             "'1 3 10', beside laspy and PDAL; draws time and memory."
         ),
     ] = "",
+    survey: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            help="Make a region of so many kilometres a side instead, build a survey of it, and register "
+            "scans of 200 m from as many places as --starts says, with and without a rough place.",
+        ),
+    ] = 0.0,
+    batch: Annotated[int, typer.Option(min=0, help="With --survey: jobs of a batch; 0 for none.")] = 0,
     threads: Annotated[int, typer.Option(min=0, help="With --scale: processor cores; 0 takes all.")] = 0,
     starts: Annotated[int, typer.Option(min=1, help="Random starts of each pair.")] = 10,
     jobs: Annotated[int, typer.Option(min=1, help="Runs at a time.")] = 1,
@@ -89,6 +98,14 @@ def benchmark(
         return
     if scale:
         _scale(scale, data or [], tuple(only or ()), out, threads, quiet)
+        return
+    if survey:
+        from mtpcr_geo.benchmark.survey import run_survey
+
+        with progress_bars(quiet) as progress:
+            told = run_survey(survey, starts, out, seed=seed, batch=batch, progress=progress)
+        if not quiet:
+            typer.echo(f"{told}\nTables: {out}")
         return
     if robustness:
         from mtpcr_geo.benchmark.robustness.suites import SuiteOptions
