@@ -226,6 +226,7 @@ def draw(jobs: Sequence[dict[str, Any]], stages: Sequence[dict[str, Any]], path:
         axis.set_ylabel(label)
     left.set_yscale("log")
     middle.set_yscale("log")
-    right.set_ylim(bottom=0)
+    # room for the legend above the lines
+    right.set_ylim(0, 1.5 * max((row["peak_mib"] or 0.0 for row in jobs), default=1.0))
     figure.savefig(path, dpi=120)
     plt.close(figure)

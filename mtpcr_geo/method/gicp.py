@@ -160,13 +160,14 @@ class Descender:
             enough: partners that do at the start: of more, every so many points are left out; None uses all.
 
         """
-        points, normals = self.source.points, self.source.normals
-        if among is not None:
-            points, normals = points[among], normals[among]
+        which = np.arange(len(self.source.points)) if among is None else among
+        points, normals = self.source.points[which], self.source.normals[which]
         partners = Partners(self._tree, self.target.points, points, within_m)
         every = 1 if enough is None else len(partners.of(T)[0]) // enough
         if every > 1:
-            points, normals = points[::every], normals[::every]
+            # by number, so that one point more or less does not change the choice of all others
+            few = which % every == 0
+            points, normals = points[few], normals[few]
             partners = Partners(self._tree, self.target.points, points, within_m)
         damping, inliers = DAMPING, 0
         for number in range(1, iterations + 1):

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
+from threading import Lock
 
 import numpy as np
 
@@ -31,7 +33,7 @@ from mtpcr_geo.match.exploration import (
     PROMISING_NEG_LOG10_P,
 )
 from mtpcr_geo.match.judge import CLEAR_MARGIN, Judge
-from mtpcr_geo.match.pose import Pose, centre_of, pose_of
+from mtpcr_geo.match.pose import Pose, centre_of
 from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.pyramid import COARSEST_SEARCH_M, LARGEST_SEARCH, Pyramid
 from mtpcr_geo.match.search import GlobalSearch, Layer, all_yaws, distinct
@@ -42,6 +44,7 @@ from mtpcr_geo.method.images import channels
 from mtpcr_geo.method.scales import Scales, filled_share, occupied_area, scales_for
 from mtpcr_geo.survey.levels import MARGIN_M, Ground, widened, windows
 from mtpcr_geo.survey.mosaic import FACTORS
+from mtpcr_geo.survey.sought import Sought, Window
 
 FEWEST_ACROSS = 24
 """Cells along the source's raster that the coarsest level leaves at least."""
@@ -58,54 +61,12 @@ DESCENT = 2
 CHUNK_M = 1000.0
 """Edge of the windows in which hypotheses are followed to the middle level together."""
 
+FEW_CELLS = 1_000_000
+"""Finest cells of all that is searched up to which they are read once for all hypotheses."""
 AT_ONCE = 4
 """Hypotheses whose finest windows are held at once."""
 
 Advance = Callable[[int], object]
-
-
-@dataclass(frozen=True, eq=False)
-class Sought:
-    """One source, or its mirror image, on the way through the levels.
-
-    Attributes:
-        bev: its height raster at the survey's finest cell, levelled.
-        prior: what is known of its pose.
-        ground: its bare ground in coarse cells.
-        layers: its channels by level, as far as they were made.
-
-    """
-
-    bev: Bev
-    prior: Prior | None
-    ground: Terrain
-    layers: dict[int, Layer] = field(default_factory=dict)
-
-    def over(self, target: Bev, shared: Pyramid | None = None) -> Pyramid:
-        """Return the levels of this source and a window of the survey; its own channels are made once."""
-        return _Window(self.bev, target, self.layers, shared)
-
-    @property
-    def grid(self) -> Grid:
-        """Grid of the raster."""
-        return self.bev.grid
-
-    @property
-    def reach_m(self) -> float:
-        """How far the raster reaches from its middle under any yaw, metres."""
-        return float(np.hypot(*self.grid.shape)) * self.grid.cell / 2
-
-    def pose_at(self, pose: Pose, of: Grid, to: Grid) -> Pose:
-        """Express a pose about the centre of one grid of this source about that of another one."""
-        return pose_of(pose.hypothesis(centre_of(of)), centre_of(to))
-
-
-class _Window(Pyramid):
-    """The levels of a source, which are kept from window to window, and of a window of the survey."""
-
-    def __init__(self, source: Bev, target: Bev, layers: dict[int, Layer], shared: Pyramid | None) -> None:
-        super().__init__(source, target, shared)
-        self._source = layers
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +161,9 @@ class _Search:
         self.searched: list[tuple[float, int]] = []
         self.proposed = 0
         self.told = False
+        self._over_all: dict[int, Pyramid] = {}
+        self._terrains: dict[float, Terrain] = {}
+        self._lock = Lock()
 
     def run(self) -> FoundPlace:
         for factor in self._factors():
@@ -267,7 +231,7 @@ class _Search:
             for number, (one, layer) in enumerate(zip(self.both, layers, strict=True)):
                 found[number] += self._propose_in(window, one, layer, target, step)
         return [
-            distinct(sorted(poses, key=lambda pose: -pose.score), self._most(region), 2 * step, 5 * cell)
+            distinct(sorted(poses, key=lambda pose: -pose.score), self._most(), 2 * step, 5 * cell)
             for poses in found
         ]
 
@@ -294,10 +258,13 @@ class _Search:
             and (window[1] + slack >= (pose.east, pose.north)).all()
         ]
 
-    def _most(self, region: Floats) -> int:
-        """Return how many hypotheses of a region are worth following."""
-        room = float(np.prod(region[1] - region[0])) / self.area
-        return int(np.clip(HYPOTHESES * room, FEWEST_PROPOSED, PROPOSED))
+    def _most(self) -> int:
+        """Return how many hypotheses are worth following, by how much land the source's middle may lie on."""
+        prior = self.both[0].prior
+        land = float(np.prod(self.ground.bounds[1] - self.ground.bounds[0]))
+        if prior is not None and prior.place is not None:
+            land = min(land, np.pi * prior.radius_m**2)
+        return int(np.clip(HYPOTHESES * land / self.area, FEWEST_PROPOSED, PROPOSED))
 
     def _yaw_step(self, source: Layer) -> float:
         """Step over all yaws, radians: about a cell and a half at the source's rim."""
@@ -339,7 +306,7 @@ class _Search:
             target = self.ground.bev(widened(np.stack([held.min(axis=0), held.max(axis=0)]), reach), middle)
             shared: Pyramid | None = None
             for number, some in enumerate(here):
-                pyramid = _Window(coarse[number], target, made[number], shared)
+                pyramid = Window(coarse[number], target, made[number], shared)
                 shared = pyramid
                 fine = [
                     self.both[number].pose_at(p, above[number], pyramid.at(factor // middle)[0].grid)
@@ -382,25 +349,56 @@ class _Search:
         here = np.tile(np.array([pose.east, pose.north]), (2, 1))
         return self.ground.bev(widened(here, one.reach_m + MARGIN_M), 1)
 
+    @cached_property
+    def _all_cells(self) -> Bev | None:
+        """The finest cells of all that is searched, where these are few; None where they are many."""
+        region = self._region()
+        if (region[0] >= region[1]).any():
+            return None
+        region = widened(region, MARGIN_M)
+        if float(np.prod((region[1] - region[0]) / self.cell)) > FEW_CELLS:
+            return None
+        return self.ground.bev(region, 1)
+
     def _fine(
         self, one: Sought, middle: int, grid: Grid, poses: Sequence[Pose]
     ) -> list[tuple[Pose, Pyramid]]:
         """Follow poses to the finest cells, each in a window of its own."""
 
         def made(pose: Pose) -> tuple[Pose, Pyramid]:
-            pyramid = one.over(self._around(one, pose))
+            pyramid = self._over(one, pose)
             start = one.pose_at(pose, grid, pyramid.at(middle)[0].grid)
             return follow(pyramid, middle, [start]).poses[0], pyramid
 
         with ThreadPoolExecutor(usable_cores()) as threads:
             return [found for found in threads.map(made, poses) if np.isfinite(found[0].score)]
 
+    def _over(self, one: Sought, pose: Pose) -> Pyramid:
+        """Return the levels of a source and the finest cells around a pose."""
+        if self._all_cells is None:
+            return one.over(self._around(one, pose))
+        key = id(one)
+        with self._lock:
+            if key not in self._over_all:
+                shared = next(iter(self._over_all.values()), None)
+                self._over_all[key] = one.over(self._all_cells, shared)
+            return self._over_all[key]
+
+    def _terrain_of(self, pyramid: Pyramid) -> Terrain:
+        """Return the bare ground of a window; that of all cells is made once for each way to see it."""
+        cell = self.scales.terrain_cell_m
+        if pyramid.target is not self._all_cells:
+            return Terrain.of(bare(pyramid.target), cell)
+        if cell not in self._terrains:
+            self._terrains[cell] = Terrain.of(bare(pyramid.target), cell)
+        return self._terrains[cell]
+
     def _judge_with(self, one: Sought, pyramid: Pyramid) -> Judge:
         settings = self.settings
         patch, radius = settings.patch_m, settings.search_radius_m
         return Judge(
             pyramid,
-            (one.ground, Terrain.of(bare(pyramid.target), self.scales.terrain_cell_m)),
+            (one.ground, self._terrain_of(pyramid)),
             self.scales,
             patch_m=self.scales.patch_m if patch is None else patch,
             search_radius_m=self.scales.search_radius_m if radius is None else radius,
@@ -415,7 +413,7 @@ class _Search:
         while pool.candidates and not pool.candidates[0].complete:
             at = next(k for k, one in enumerate(judged) if one is pool.candidates[0])
             one, pose = self.both[number], judged[at].pose
-            judged[at] = self._judge_with(one, one.over(self._around(one, pose))).judge_one(pose)
+            judged[at] = self._judge_with(one, self._over(one, pose)).judge_one(pose)
             pool = Pool.of(judged, self.scales, bound)
         self.pools[number] = pool
 
