@@ -14,7 +14,7 @@ from mtpcr_geo.core.scanner import Scanner
 from mtpcr_geo.core.types import Pair, Side
 from mtpcr_geo.crs.resolve import resolve_frames
 from mtpcr_geo.io.outputs import OutputSet
-from mtpcr_geo.io.sample import scan
+from mtpcr_geo.io.sample import Scan, scan
 from mtpcr_geo.match.correlation import CorrelationSettings
 from mtpcr_geo.match.pose import centre_of
 from mtpcr_geo.match.prior import Prior
@@ -41,6 +41,8 @@ class Located(ComparesArrays):
         place: (2,) where the middle of the cloud's raster lies, in units of the survey's CRS.
         pivot: (2,) that middle in the levelled source's frame, metres.
         box: (2, 2) what to cut out of the survey, in units of its CRS.
+        scan: what one pass over the cloud gave.
+        source: the cloud as it was levelled.
 
     """
 
@@ -48,6 +50,8 @@ class Located(ComparesArrays):
     place: Floats
     pivot: Floats
     box: Floats
+    scan: Scan
+    source: Side
 
 
 def locate(source: Cloud, survey: Survey, options: RegisterOptions, progress: Progress) -> Located:
@@ -66,7 +70,8 @@ def locate(source: Cloud, survey: Survey, options: RegisterOptions, progress: Pr
         InputError: if the cloud or the survey cannot be used.
 
     """
-    pair = _pair(source, survey, options, progress)
+    scanned = scan(source, seed=options.seed, progress=progress)
+    pair = _pair(source, scanned, survey, options)
     # nothing is written by what only searches
     with OutputSet() as outputs:
         bev = rasterised(pair.source, survey.frame.cell_m, "centre", RunContext(outputs, progress))
@@ -82,15 +87,15 @@ def locate(source: Cloud, survey: Survey, options: RegisterOptions, progress: Pr
     with progress.task("searching the survey", None) as advance:
         found = search(bev, ground, settings, options.seed, prior, advance)
     pivot = centre_of(bev.grid)
-    return Located(found, found.place / survey.frame.unit_m, pivot, _box(bev.grid.shape, found, survey))
+    place, box = found.place / survey.frame.unit_m, _box(bev.grid.shape, found, survey)
+    return Located(found, place, pivot, box, scanned, pair.source)
 
 
-def _pair(source: Cloud, survey: Survey, options: RegisterOptions, progress: Progress) -> Pair:
+def _pair(source: Cloud, scanned: Scan, survey: Survey, options: RegisterOptions) -> Pair:
     """Return the source levelled, beside a target that is no more than the survey's extent."""
     box = survey.bounds
     corners = np.array([[x, y, z] for x in box[:, 0] for y in box[:, 1] for z in box[:, 2]])
     extent = ArrayCloud(corners, survey.frame.crs, str(survey.folder))
-    scanned = scan(source, seed=options.seed, progress=progress)
     frame, target_link, source_link = resolve_frames(
         extent,
         source,

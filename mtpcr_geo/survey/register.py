@@ -11,7 +11,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import InputError, OptionError
 from mtpcr_geo.core.paths import real
 from mtpcr_geo.core.progress import NoProgress, Progress
-from mtpcr_geo.core.types import Hypothesis, Matches, Pair
+from mtpcr_geo.core.types import Hypothesis, Levelling, Matches, Pair
 from mtpcr_geo.io.formats import files_at, open_any
 from mtpcr_geo.io.memory import cloud_of
 from mtpcr_geo.match.base import LARGEST_MARGIN, Advance, View
@@ -35,14 +35,19 @@ from mtpcr_geo.pipeline.stages.matching import Match, MatchOptions, view_of
 from mtpcr_geo.pipeline.stages.memory import MemoryReader
 from mtpcr_geo.pipeline.stages.pairs import bevs_of
 from mtpcr_geo.pipeline.stages.priors import audit_of, known_place
+from mtpcr_geo.pipeline.stages.rasters import Level, LevelOptions
 from mtpcr_geo.pipeline.stages.steps import further_files, reader_of, steps_of, writers_for
 from mtpcr_geo.registration import Registration, read_options
 from mtpcr_geo.survey.cut import CutOut, cut_out
 from mtpcr_geo.survey.index import Survey
 from mtpcr_geo.survey.locate import Located, locate
+from mtpcr_geo.survey.search import FoundPlace
 
 if TYPE_CHECKING:
+    from mtpcr_geo.core.arrays import Floats
+    from mtpcr_geo.core.frames import FrameLink
     from mtpcr_geo.io.memory import CloudLike
+    from mtpcr_geo.io.sample import Scan
 
 NEAR_YAW_DEG = 10.0
 """How far the pose is sought again from the yaw that the mosaic gave, on the points themselves."""
@@ -80,7 +85,26 @@ class SurveyMatcher:
     ) -> Matches:
         """Match two rasters, see `mtpcr_geo.match.base.Matcher.match`; a known yaw is not made use of."""
         found = match(source.bev, target.bev, self.settings, seed, advance, self.prior)
-        return in_survey(found, self.located, self.hypotheses)
+        return in_survey(found, self.located.found, self.hypotheses)
+
+
+class LevelInSurvey(Level):
+    """Levels as usual, but does not look again at the source, which the search has scanned and levelled."""
+
+    def __init__(self, options: LevelOptions, tag: str, located: Located) -> None:
+        super().__init__(options, tag)
+        self.located = located
+
+    def scanned(self, role: Literal["target", "source"], cloud: Cloud, context: RunContext) -> Scan:
+        """Return what one pass over a cloud gives."""
+        return self.located.scan if role == "source" else super().scanned(role, cloud, context)
+
+    def levelled(self, role: Literal["target", "source"], link: FrameLink, sample: Floats) -> Levelling:
+        """Return the rotation that makes a cloud upright, from a sample (n, 3) in work coordinates."""
+        known = self.located.source
+        if role == "source" and np.array_equal(sample, known.sample):
+            return known.levelling
+        return super().levelled(role, link, sample)
 
 
 class MatchInSurvey(Stage):
@@ -147,18 +171,17 @@ class MatchInSurvey(Stage):
         }
 
 
-def in_survey(matches: Matches, located: Located, hypotheses: Sequence[Hypothesis]) -> Matches:
+def in_survey(matches: Matches, found: FoundPlace, hypotheses: Sequence[Hypothesis]) -> Matches:
     """Return matches at a place with the rivals and the mirrored world of the whole survey.
 
     Strengths depend on the cell; those of the survey are scaled so that its best equals the place's.
 
     Args:
         matches: of the source to the points at the place.
-        located: what the survey gave.
+        found: what the search of the survey found.
         hypotheses: of the survey, best first, between the levelled clouds that were matched.
 
     """
-    found = located.found
     strength = matches.strength or 0.0
     best = found.best.strength
     scale = strength / best if best > 0.0 else 0.0
@@ -167,7 +190,7 @@ def in_survey(matches: Matches, located: Located, hypotheses: Sequence[Hypothesi
     elsewhere = [
         replace(one, strength=strength * value / first)
         for one, value in zip(hypotheses[1:], ranked[1:], strict=True)
-        if first > 0.0 and not _same(one, matches.hypotheses[0], located)
+        if first > 0.0 and not _same(one, matches.hypotheses[0], found)
     ]
     further = sorted([*matches.hypotheses[1:], *elsewhere], key=lambda one: -(one.strength or 0.0))
     mirrored = [*(matches.mirrored_strengths or ()), *(c.strength * scale for c in found.mirrored.candidates)]
@@ -192,13 +215,13 @@ def in_survey(matches: Matches, located: Located, hypotheses: Sequence[Hypothesi
     )
 
 
-def _same(one: Hypothesis, other: Hypothesis, located: Located) -> bool:
+def _same(one: Hypothesis, other: Hypothesis, found: FoundPlace) -> bool:
     """Return whether two hypotheses put the source's middle at one place, turned alike."""
     from mtpcr_geo.match.candidates import SAME_YAW_DEG
     from mtpcr_geo.match.pose import pose_of
 
-    a, b = pose_of(one, located.pivot), pose_of(other, located.pivot)
-    near = float(np.hypot(a.east - b.east, a.north - b.north)) < located.found.scales.same_pose_m
+    a, b = pose_of(one, found.pivot), pose_of(other, found.pivot)
+    near = float(np.hypot(a.east - b.east, a.north - b.north)) < found.scales.same_pose_m
     return near and angle_between(a.yaw, b.yaw) < np.radians(SAME_YAW_DEG)
 
 
@@ -243,12 +266,7 @@ def register_in_survey(
     _check_foreign(source, opened)
     located = locate(cloud, opened, chosen, progress)
     cut = cut_out(opened, located.box)
-    steps = [
-        MatchInSurvey(stage.options, stage.tag, located, cut)
-        if isinstance(stage, Match) and isinstance(stage.options, MatchOptions)
-        else stage
-        for stage in steps_of(chosen)
-    ]
+    steps = [_in_survey(stage, located, cut) for stage in steps_of(chosen)]
     nodes = [*chained([MemoryReader(cut, "target")]), *chained([reader])]
     nodes += chained(steps, ("target", "source"))
     if out is None:
@@ -256,6 +274,15 @@ def register_in_survey(
     nodes += chained(writers, (nodes[-1].tag,))
     earlier = further_files(Path(out))
     return Registration(run(nodes, overwrite=chosen.overwrite, progress=progress, replaces=earlier), chosen)
+
+
+def _in_survey(stage: Stage, located: Located, cut: CutOut) -> Stage:
+    """Return what a stage is in a survey."""
+    if isinstance(stage, Match):
+        return MatchInSurvey(stage.options, stage.tag, located, cut)
+    if isinstance(stage, Level):
+        return LevelInSurvey(stage.options, stage.tag, located)
+    return stage
 
 
 def _check(options: RegisterOptions) -> None:

@@ -23,7 +23,6 @@ from mtpcr_geo.registration import Registration
 from mtpcr_geo.survey.build import build_survey
 from mtpcr_geo.survey.cut import cut_out
 from mtpcr_geo.survey.index import Survey
-from mtpcr_geo.survey.locate import Located
 from mtpcr_geo.survey.options import BuildOptions
 from mtpcr_geo.survey.register import in_survey, register_in_survey
 from mtpcr_geo.survey.search import FoundPlace
@@ -131,7 +130,6 @@ def test_rivals_and_the_mirrored_world_of_the_whole_survey_count() -> None:
     pivot = np.zeros(2)
     pool = Pool((best, rival, again), (36.0, 28.8, 27.0))
     place = FoundPlace(pool, mirrored, pivot, pivot, 50.0, scales, ((8.0, 1),), 3)
-    located = Located(place, pivot, pivot, np.zeros((2, 2)))
     hypotheses = [one.pose.hypothesis(pivot) for one in pool.candidates]
     px = np.zeros((4, 2))
     # at the place nothing rivals it, and strengths are those of finer cells
@@ -146,7 +144,7 @@ def test_rivals_and_the_mirrored_world_of_the_whole_survey_count() -> None:
         null_ratio=9.0,
         mirrored_strengths=(8.0,),
     )
-    found = in_survey(matches, located, hypotheses)
+    found = in_survey(matches, place, hypotheses)
     assert found.margin == pool.margin == 36.0 / 28.8
     assert found.null_ratio == pytest.approx(40.0 / 25.0)
     # the same place found twice is no rival; the other one is, at the strength it has beside the best

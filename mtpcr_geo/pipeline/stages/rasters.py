@@ -121,8 +121,7 @@ class Level(Stage):
         """Scan, sample and level each cloud."""
         from mtpcr_geo.io.file_cloud import precision_remark
         from mtpcr_geo.io.las import check_distinct
-        from mtpcr_geo.io.sample import header_remark, scan
-        from mtpcr_geo.method.levelling import level
+        from mtpcr_geo.io.sample import header_remark
 
         clouds = [value for value in inputs if isinstance(value, Cloud)]
         if len(clouds) != len(inputs) or len(clouds) not in (1, 2):
@@ -135,18 +134,15 @@ class Level(Stage):
             if cloud.count > options.budget:
                 # the rasters take all points: a second pass
                 cloud.keep(context.at_end)
-        found = [
-            scan(cloud, budget=options.budget, seed=options.seed, progress=context.progress)
-            for cloud in clouds
-        ]
+        roles: tuple[Literal["target", "source"], ...] = ("target", "source")
+        found = [self.scanned(role, cloud, context) for role, cloud in zip(roles, clouds, strict=False)]
         frame, *links = self._frames(target, source, [scanned.bounds for scanned in found])
         sides = []
-        roles: tuple[Literal["target", "source"], ...] = ("target", "source")
         for role, cloud, link, scanned in zip(roles, clouds, links, found, strict=False):
             if link.file_crs is None and link.scanner.unit is None:
                 check_unit(cloud.name, role, scanned.sample, scanned.count)
             sample = in_work_frame(link, scanned.sample)
-            levelling = level(sample, options.method, link.georeferenced, options.seed)
+            levelling = self.levelled(role, link, sample)
             self.metadata[role] = {
                 "points": scanned.count,
                 "noise_points": scanned.dropped,
@@ -162,6 +158,18 @@ class Level(Stage):
             side = side_of(role, cloud, link, scanned, sample, levelling)
             sides.append(replace(side, remarks=remarks))
         return Pair(sides[0], sides[-1], frame)
+
+    def scanned(self, role: Literal["target", "source"], cloud: Cloud, context: RunContext) -> Scan:
+        """Return what one pass over a cloud gives."""
+        from mtpcr_geo.io.sample import scan
+
+        return scan(cloud, budget=self.options.budget, seed=self.options.seed, progress=context.progress)
+
+    def levelled(self, role: Literal["target", "source"], link: FrameLink, sample: Floats) -> Levelling:
+        """Return the rotation that makes a cloud upright, from a sample (n, 3) in work coordinates."""
+        from mtpcr_geo.method.levelling import level
+
+        return level(sample, self.options.method, link.georeferenced, self.options.seed)
 
 
 def side_of(
