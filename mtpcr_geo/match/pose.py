@@ -70,7 +70,10 @@ def warp_to(source: Image, source_grid: Grid, target_grid: Grid, pose: Pose) -> 
 def warp(source: Image, M: Floats, size: tuple[int, int]) -> Image:
     """Sample (k, h, w) images bilinearly where a (2, 3) map puts the pixels of an image of a size."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.stack([cv2.warpAffine(image, M, size, flags=flags) for image in source])
+    out = np.empty((len(source), size[1], size[0]), np.float32)
+    for image, place in zip(source, out, strict=True):
+        cv2.warpAffine(image, M, size, dst=place, flags=flags)
+    return out
 
 
 def source_from_target_pixels(source_grid: Grid, target_grid: Grid, pose: Pose) -> Floats:
