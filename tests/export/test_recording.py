@@ -18,6 +18,7 @@ from helpers_scene import ORIGIN, make_pair, true_transform
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.recorder import NullRecorder, Recorder
 from mtpcr_geo.core.types import Pair
+from mtpcr_geo.export.recording import recorder as recorder_module
 from mtpcr_geo.export.recording import writer
 from mtpcr_geo.export.recording.budget import Budget
 from mtpcr_geo.export.recording.recorder import RerunRecorder
@@ -309,6 +310,26 @@ def test_the_other_process_ends_with_the_run(tmp_path):
     assert done.returncode == 9
     assert not (tmp_path / "a.rrd").exists()
     assert ended(int(done.stdout))
+
+
+@pytest.mark.parametrize(
+    ("argv", "executable", "cores", "apart"),
+    [
+        (["/usr/bin/mtpcr-geo", "register"], "/usr/bin/python3.11", 2, True),
+        (["/usr/bin/mtpcr-geo", "register"], "/usr/bin/python3.11", 1, False),
+        (["/usr/bin/mtpcr-geo", "register"], "/opt/qgis/bin/qgis-bin.exe", 2, False),
+        (["notebook.py"], "/usr/bin/python3.11", 2, False),
+    ],
+)
+def test_only_a_command_draws_in_another_process(monkeypatch, argv, executable, cores, apart):
+    monkeypatch.setattr(sys, "argv", argv)
+    monkeypatch.setattr(sys, "executable", executable)
+    monkeypatch.setattr(recorder_module, "usable_cores", lambda: cores)
+    monkeypatch.setattr(recorder_module, "_opened", False)
+    monkeypatch.delitem(sys.modules, "rerun")
+    assert recorder_module._pays_apart() is apart
+    # rerun will be needed again, and pays once for all
+    assert recorder_module._pays_apart() is False
 
 
 def test_importing_the_recorder_does_not_import_rerun():

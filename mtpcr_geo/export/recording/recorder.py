@@ -108,7 +108,11 @@ def _pays_apart() -> bool:
     """Return whether another process saves time: rerun is not imported here, and will not be needed again."""
     global _opened
     first, _opened = not _opened, True
-    return first and command_line() is not None and usable_cores() > 1 and "rerun" not in sys.modules
+    # a program that only holds Python would start itself again
+    python = "python" in Path(sys.executable or "").name.lower() and not hasattr(sys, "frozen")
+    return (
+        first and python and command_line() is not None and usable_cores() > 1 and "rerun" not in sys.modules
+    )
 
 
 _opened = False
