@@ -228,5 +228,5 @@ def draw(jobs: Sequence[dict[str, Any]], stages: Sequence[dict[str, Any]], path:
     middle.set_yscale("log")
     # room for the legend above the lines
     right.set_ylim(0, 1.5 * max((row["peak_mib"] or 0.0 for row in jobs), default=1.0))
-    figure.savefig(path, dpi=120)
+    figure.savefig(path, dpi=90)
     plt.close(figure)
