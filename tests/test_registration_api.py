@@ -262,7 +262,8 @@ def test_repr_is_a_few_lines(of_arrays):
     assert lines[0] == "Registration: accepted"
     assert len(lines) <= 10
     assert max(map(len, lines)) < 140
-    assert any("yaw +61.0" in line for line in lines)
+    yaw = next(float(line.split("yaw ")[1].split("°")[0]) for line in lines if "yaw " in line)
+    assert yaw == pytest.approx(61.0, abs=0.05)
     assert any("m²" in line and "of the source" in line for line in lines)
 
 

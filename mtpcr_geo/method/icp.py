@@ -27,6 +27,9 @@ FINE_CELL_M = 2.0
 
 STILL_RAD = 4e-6
 STILL_M = 1e-4
+LAST_ROUND = 4
+"""Times as many iterations as another round that the last one may take: on level ground points slide slowly,
+and a result that does not stand still depends on the start."""
 ROUGH_SLACK, ROUGH_PARTNERS = 25.0, 7_500
 """For all rounds but the last: times the usual step at which they stand still, and partners that do."""
 NEIGHBOURS = 10
@@ -161,7 +164,7 @@ class Surfaces:
             T_from: 4x4 from source to target, work coordinates.
             rounds: correspondence distance of each round, and which points take part.
             method: "gicp" (plane to plane), "point_to_plane", or "point_to_point" (the paper's citation).
-            iterations: at most, each round.
+            iterations: at most, each round; four times as many in the last.
 
         """
         X = self._relative(T_from)
@@ -176,7 +179,7 @@ class Surfaces:
                 X,
                 within_m=distance,
                 method=method,
-                iterations=iterations,
+                iterations=iterations * (LAST_ROUND if last else 1),
                 still_rad=slack * STILL_RAD,
                 still_m=slack * STILL_M,
                 among=None if last else trimmed,

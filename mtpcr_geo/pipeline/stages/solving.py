@@ -147,7 +147,9 @@ class RefineOptions(StageOptions):
         ge=200,
         description="points of the source after thinning; the target may have three times as many",
     )
-    iterations: int = Field(30, ge=1, description="iterations of each round at most")
+    iterations: int = Field(
+        30, ge=1, description="iterations of a round at most; four times as many of the last"
+    )
     motion: Motion = "rigid"
     ground: bool = Field(True, description="settle height and tilt on the ground before, and height after")
     feedback: bool = Field(
