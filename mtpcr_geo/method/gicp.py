@@ -21,8 +21,9 @@ ALONG_NORMAL = 1e-3
 """Variance of a surface along its normal, as a share of that across it (the paper's epsilon)."""
 FEWEST_PARTNERS = 6
 _HAIR_M = 1e-9  # rounding could tip what is nearly halfway
-DAMPING, DAMPING_FACTOR, MOST_TRIES = 1e-3, 10.0, 10
-"""Damping of Levenberg and Marquardt's step at first, by what it changes, and how often it is raised."""
+DAMPING, DAMPING_FACTOR, LEAST_DAMPING, MOST_TRIES = 1e-3, 10.0, 1e-9, 10
+"""Damping of Levenberg and Marquardt's step at first, by what it changes, where it stops falling, and how often
+it is raised."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,7 @@ class Descender:
                 damping *= DAMPING_FACTOR
             else:  # however short, no step is better
                 return Descended(T, number, inliers, converged=True)
-            damping /= DAMPING_FACTOR
+            damping = max(damping / DAMPING_FACTOR, LEAST_DAMPING)
             T = change @ T
             if np.linalg.norm(step[:3]) <= still_rad and np.linalg.norm(step[3:]) <= still_m:
                 return Descended(T, number, inliers, converged=True)
