@@ -22,8 +22,8 @@ ALONG_NORMAL = 1e-3
 FEWEST_PARTNERS = 6
 _HAIR_M = 1e-9  # rounding could tip what is nearly halfway
 DAMPING, DAMPING_FACTOR, LEAST_DAMPING, MOST_TRIES = 1e-3, 10.0, 1e-9, 10
-"""Damping of Levenberg and Marquardt's step at first, by what it changes, where it stops falling, and how often
-it is raised."""
+"""Damping of Levenberg and Marquardt's step at first, by what it changes, where it stops falling, and how
+often it is raised."""
 
 
 @dataclass(frozen=True)
