@@ -264,11 +264,13 @@ def write_tile(folder: Path, region: Region, low: tuple[float, float], edge: flo
     return path
 
 
-def write_scan(path: Path, region: Region, middle: tuple[float, float], seed: int, radius: float) -> Floats:
+def write_scan(
+    path: Path, region: Region, middle: tuple[float, float], seed: int, radius: float
+) -> tuple[Floats, Floats]:
     """Write a scan in a frame of its own, turned by any yaw and tilted by up to 3 degrees.
 
     Returns:
-        4x4 from its coordinates to those of the region's CRS.
+        4x4 from its coordinates to those of the region's CRS, and the (2,) mean of its points there.
 
     """
     xyz = scan(region, np.array(middle), seed, radius)
@@ -281,4 +283,4 @@ def write_scan(path: Path, region: Region, middle: tuple[float, float], seed: in
     T_region_scan = transforms.compose(R, np.array([*(np.array(middle) + CORNER), float(xyz[:, 2].mean())]))
     local = transforms.apply(transforms.inverse(T_region_scan), xyz)
     write_laz(path, ArrayCloud(local))
-    return T_region_scan
+    return T_region_scan, transforms.apply(T_region_scan, local.mean(axis=0)[None])[0, :2]

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from mtpcr_geo.benchmark.metrics import rotation_error_deg
-from mtpcr_geo.benchmark.region import CORNER, Region, write_scan, write_tile
+from mtpcr_geo.benchmark.region import Region, write_scan, write_tile
 from mtpcr_geo.benchmark.yardsticks import Measured, measured
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
@@ -56,7 +56,7 @@ class Place:
         number: of the place.
         scan: the file.
         T: 4x4 from its coordinates to those of the region's CRS.
-        near: (2,) a place in the CRS within `NEAR_M` of its middle.
+        near: (2,) a place in the CRS within `NEAR_M` of the mean of its points.
 
     """
 
@@ -170,12 +170,15 @@ def _made_scans(region: Region, edge_m: float, count: int, folder: Path, seed: i
     for number in range(count):
         middle = rng.uniform(RADIUS_M, edge_m - RADIUS_M, 2)
         away, angle = NEAR_M * np.sqrt(rng.random()), rng.uniform(0.0, 2.0 * np.pi)
-        near = middle + CORNER + away * np.array([np.cos(angle), np.sin(angle)])
         path, truth = folder / f"scan{number:03d}.laz", folder / f"scan{number:03d}.json"
         if not truth.exists():
-            T = write_scan(path, region, (float(middle[0]), float(middle[1])), number, RADIUS_M)
-            truth.write_text(json.dumps(T.tolist()), encoding="utf-8")
-        T = np.array(json.loads(truth.read_text(encoding="utf-8")))
+            T, points = write_scan(path, region, (float(middle[0]), float(middle[1])), number, RADIUS_M)
+            known = {"T_region_scan": T.tolist(), "mean_of_points": points.tolist()}
+            truth.write_text(json.dumps(known), encoding="utf-8")
+        known = json.loads(truth.read_text(encoding="utf-8"))
+        T = np.array(known["T_region_scan"])
+        # --near says where the mean of the points lies
+        near = np.array(known["mean_of_points"]) + away * np.array([np.cos(angle), np.sin(angle)])
         made.append(Place(number, path, T, (float(near[0]), float(near[1]))))
     return made
 
