@@ -38,6 +38,22 @@ class View:
 
 
 @dataclass(frozen=True)
+class DescribedPlaces:
+    """Descriptors of places on a lattice over an image, where it shows something.
+
+    Attributes:
+        px: (n, 2) float64 pixel coordinates (column, row).
+        descriptors: (n, d) float32 of unit length.
+        step_px: distance between neighbouring places, pixels.
+
+    """
+
+    px: Floats
+    descriptors: NDArray[np.float32]
+    step_px: float
+
+
+@dataclass(frozen=True)
 class Features:
     """Keypoints of an image, best first.
 
@@ -45,12 +61,14 @@ class Features:
         px: (n, 2) float64 pixel coordinates (column, row), pixel centres at integers.
         score: (n,) float32 strength, whatever its scale.
         descriptors: (n, d) float32 of unit length, or uint8 bits for binary descriptors.
+        places: what the extractor says of all places of the image, keypoints or not; None if it does not.
 
     """
 
     px: Floats
     score: NDArray[np.float32]
     descriptors: NDArray[Any]
+    places: DescribedPlaces | None = None
 
     def __len__(self) -> int:
         return len(self.score)

@@ -7,10 +7,9 @@ metres; those of a wrong one do not. Cells may differ in size: both images are b
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,8 +19,12 @@ from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Hypothesis, Matches
 from mtpcr_geo.match.base import Advance, Features, ImageMatcher, PixelMatches, View, margin_of, one_to_one
+from mtpcr_geo.match.likelihood import TurnedPlaces, poses_by_likelihood
 from mtpcr_geo.match.search import angle_between
+from mtpcr_geo.match.turning import NOT_TURNED, ZOOM, affine, magnified, places_on_ground, shrunk, turn_image
 from mtpcr_geo.match.votes import (
+    EXAMINED,
+    KEPT,
     LEAST_STRENGTH,
     Candidates,
     VotedPose,
@@ -29,13 +32,13 @@ from mtpcr_geo.match.votes import (
     candidates_of,
     poses_by_votes,
     strengths_of,
+    votes_for,
 )
 from mtpcr_geo.method.solve import ransac_upright
 
 TRIES = 20_000
 """Pairs of matches tried for a yaw and a shift: finds a pose that 2 % of the matches support."""
 AGREE_CELLS = 1.5
-ZOOM = 2.0
 
 
 @dataclass(frozen=True)
@@ -177,28 +180,29 @@ class KeypointMatcher:
         nearest orientation, agreeing or not. The margin is over the next distinct pose and over the best of
         the mirrored source, which looks alike and has no right pose.
         """
-        target_px = _shrunk(prepared[0].px, zoom)
+        target_px = shrunk(prepared[0].px, zoom)
+        frame = _Frame(source.grid, target.grid, zoom, tolerance)
         orientations, turned = [], []
         for turn in turns:
             one = _Turned.of(image, source.empty, turn, self.images)
             orientations.append(self._candidates_of(one, prepared[0], zoom, turn, source.grid))
             turned.append(one)
             advance(1)
-        voted = poses_by_votes(orientations, target_px, target.grid, tolerance)
+        voted = _posed(turns, turned, orientations, prepared[0], frame)
         keypoints = max(len(one.source) for one in orientations), len(target_px)
         if not voted or not len(voted[0].found):
             raise RegistrationError(self._nothing(keypoints, image.size))
         flipped = np.ascontiguousarray(image[:, ::-1])
-        mirrored = poses_by_votes(
+        others = [_Turned.of(flipped, source.empty, turn, self.images) for turn in turns]
+        mirrored = _posed(
+            turns,
+            others,
             [
-                self._candidates_of(
-                    _Turned.of(flipped, source.empty, turn, self.images), prepared[0], zoom, turn, source.grid
-                )
-                for turn in turns
+                self._candidates_of(one, prepared[0], zoom, turn, source.grid)
+                for turn, one in zip(turns, others, strict=True)
             ],
-            target_px,
-            target.grid,
-            tolerance,
+            prepared[0],
+            frame,
         )
         best = voted[0]
         yaw = transforms.yaw_of(best.T[:3, :3])
@@ -216,7 +220,8 @@ class KeypointMatcher:
         )
         strengths, null = strengths_of(voted), strengths_of(mirrored)
         hypotheses = tuple(_hypothesis(one, value) for one, value in zip(voted, strengths, strict=True))
-        margin = margin_of(strengths, floor=max([*null, LEAST_STRENGTH]))
+        rivals = [one.as_rival for one in (*voted[1:], *mirrored)]
+        margin = margin_of([strengths[0], max(rivals, default=LEAST_STRENGTH)])
         report: dict[str, Any] = {
             "method": self.name,
             "cell_m": [source.grid.cell, target.grid.cell],
@@ -250,7 +255,7 @@ class KeypointMatcher:
         self, turned: _Turned, target: Features, zoom: float, turn: float, grid: Grid
     ) -> Candidates:
         features = cast(Features, turned.prepared[0])
-        px = _shrunk(_affine(turned.back, features.px), zoom)
+        px = shrunk(affine(turned.back, features.px), zoom)
         return candidates_of(turn, features, px, target, grid, self.candidates)
 
     def _nothing(self, keypoints: tuple[int, int], pixels: int) -> str:
@@ -285,67 +290,46 @@ class _Turned:
         found = images.match(self.prepared, target, most)
         return one_to_one(
             PixelMatches(
-                _shrunk(_affine(self.back, found.source_px), zoom),
-                _shrunk(found.target_px, zoom),
+                shrunk(affine(self.back, found.source_px), zoom),
+                shrunk(found.target_px, zoom),
                 np.clip(found.score, 0.0, 1.0),
-                _shrunk(_affine(self.back, found.source_keypoints), zoom),
-                _shrunk(found.target_keypoints, zoom),
+                shrunk(affine(self.back, found.source_keypoints), zoom),
+                shrunk(found.target_keypoints, zoom),
             )
         )
 
 
-def _shrunk(px: Floats, zoom: float) -> Floats:
-    """Take (n, 2) pixels of a magnified image back to those of the image."""
-    return np.asarray((px + 0.5) / zoom - 0.5)
+@dataclass(frozen=True)
+class _Frame:
+    """What the pixels of two magnified images mean: the rasters' grids, the magnification, the tolerance."""
+
+    source: Grid
+    target: Grid
+    zoom: float
+    tolerance: float
 
 
-def magnified(image: Grey, zoom: float) -> Grey:
-    """Magnify a (h, w) uint8 image, with pixel (c, r) going to ``(c + 0.5) * zoom - 0.5`` and so on."""
-    if zoom == 1.0:
-        return image
-    height, width = image.shape
-    size = (round(width * zoom), round(height * zoom))
-    M = np.array([[zoom, 0.0, 0.5 * zoom - 0.5], [0.0, zoom, 0.5 * zoom - 0.5]])
-    # not cv2.resize, which would round the scale to whole pixels
-    bigger = cv2.warpAffine(image, M, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(bigger, np.uint8)
-
-
-def turn_image(image: Grey, turn: float, fill: int) -> tuple[Grey, Floats]:
-    """Turn an image counter-clockwise (north up) onto a canvas that holds all of it.
-
-    Args:
-        image: (h, w) uint8.
-        turn: radians.
-        fill: grey value of what lies outside.
-
-    Returns:
-        The turned image, and the (2, 3) affine map from its pixels to those of the image given.
-
-    """
-    if turn == 0.0:
-        return image, np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    height, width = image.shape
-    c, s = np.cos(turn), np.sin(turn)
-    # rows run south, so that counter-clockwise seen from above turns (column, row) by minus the angle
-    R = np.array([[c, s], [-s, c]])
-    size = np.ceil(np.abs(R) @ [width, height]).astype(int)
-    middle, new_middle = np.array([width - 1, height - 1]) / 2, (size - 1) / 2
-    back = np.column_stack([R.T, middle - R.T @ new_middle])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    turned = cv2.warpAffine(
-        image,
-        back,
-        (int(size[0]), int(size[1])),
-        flags=flags,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=(float(fill),),
-    )
-    return np.asarray(turned, np.uint8), back
-
-
-def _affine(M: Floats, px: Floats) -> Floats:
-    return np.asarray(px @ M[:, :2].T + M[:, 2])
+def _posed(
+    turns: list[float],
+    turned: list[_Turned],
+    orientations: list[Candidates],
+    target: Features,
+    frame: _Frame,
+) -> list[VotedPose]:
+    """Find poses by the descriptors of all places if the network gives these, else by keypoints' votes."""
+    target_px = shrunk(target.px, frame.zoom)
+    if target.places is None:
+        return poses_by_votes(orientations, target_px, frame.target, frame.tolerance)
+    seen = []
+    for turn, one in zip(turns, turned, strict=True):
+        places = cast(Features, one.prepared[0]).places
+        assert places is not None  # the target's features have them, and come of the same graph
+        seen.append(TurnedPlaces(turn, places_on_ground(places, one.back, frame.zoom, frame.source)))
+    whole = places_on_ground(target.places, NOT_TURNED, frame.zoom, frame.target)
+    found = poses_by_likelihood(seen, whole, most=EXAMINED, yaw=turns[0] if len(turns) == 1 else None)
+    agreeing = votes_for([one.T for one in found], orientations, target_px, frame.target, frame.tolerance)
+    weighed = [replace(one, likelihood=pose.strength) for one, pose in zip(agreeing, found, strict=True)]
+    return sorted(weighed, key=lambda one: -one.strength)[:KEPT]
 
 
 def _judge(

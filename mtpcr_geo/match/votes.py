@@ -36,9 +36,11 @@ EXAMINED = 24
 """Distinct poses of most votes whose votes are counted one to one."""
 APART_DEG, APART_TOLERANCES = 5.0, 8.0
 """Two poses are distinct where they turn or move the source's keypoints apart by more than this."""
+KEPT = 8
+"""Poses handed on."""
 ROUNDS = 5
 LEAST_STRENGTH = 6.0
-"""Strength that the next pose counts at least: of a handful of agreeing pairs one more or less is chance."""
+"""Agreeing pairs that the next pose counts at least: of a handful one more or less is chance."""
 
 
 @dataclass(frozen=True)
@@ -68,11 +70,27 @@ class VotedPose:
     Attributes:
         T: 4x4 planar pose, metres.
         found: one-to-one pairs that agree, pixels of the unturned images.
+        likelihood: what speaks for it beyond the pairs, see `mtpcr_geo.match.likelihood`; None if not asked.
 
     """
 
     T: Floats
     found: PixelMatches
+    likelihood: float | None = None
+
+    @property
+    def strength(self) -> float:
+        """Return how many pairs agree, less the two that always do, times the likelihood where it was asked."""
+        return self._weight * max(len(self.found) - 2.0, 0.0)
+
+    @property
+    def as_rival(self) -> float:
+        """Return the strength that another pose is held against: of a handful of pairs one more is chance."""
+        return self._weight * max(len(self.found) - 2.0, LEAST_STRENGTH)
+
+    @property
+    def _weight(self) -> float:
+        return 1.0 if self.likelihood is None else self.likelihood
 
 
 def agreeing_keypoints(one: Candidates, T: Floats, target: Floats, tolerance: float) -> int:
@@ -109,14 +127,16 @@ def candidates_of(
         none = np.empty((len(source), 0))
         return Candidates(turn, source_px, grid.to_metres(source_px), none.astype(np.int64), none)
     likeness = np.asarray(source.descriptors @ target.descriptors.T, np.float64)
-    partner = np.argsort(-likeness, axis=1, kind="stable")[:, :k]
+    some = np.sort(np.argpartition(-likeness, k - 1, axis=1)[:, :k], axis=1)
+    order = np.argsort(-np.take_along_axis(likeness, some, axis=1), axis=1, kind="stable")
+    partner = np.take_along_axis(some, order, axis=1)
     return Candidates(
         turn, source_px, grid.to_metres(source_px), partner, np.take_along_axis(likeness, partner, axis=1)
     )
 
 
 def poses_by_votes(
-    orientations: Sequence[Candidates], target_px: Floats, grid: Grid, tolerance: float, most: int = 8
+    orientations: Sequence[Candidates], target_px: Floats, grid: Grid, tolerance: float, most: int = KEPT
 ) -> list[VotedPose]:
     """Find the poses on which most candidates agree.
 
@@ -147,9 +167,41 @@ def poses_by_votes(
     return [by_pose[pose] for pose in distinct(by_pose, most, turned, apart)]
 
 
+def votes_for(
+    poses: Sequence[Floats],
+    orientations: Sequence[Candidates],
+    target_px: Floats,
+    grid: Grid,
+    tolerance: float,
+) -> list[VotedPose]:
+    """Find the candidates that agree on given poses, which stay as they are.
+
+    A pose that was fitted to thousands of places is better than what some dozens of keypoints make of it.
+
+    Args:
+        poses: 4x4 planar poses, metres.
+        orientations: the candidates of each orientation tried.
+        target_px: (m, 2) keypoints of the target, pixels.
+        grid: of the target.
+        tolerance: plan distance within which candidates agree, metres.
+
+    Returns:
+        What was found of each pose, in the order given.
+
+    """
+    target, origin = grid.to_metres(target_px), np.zeros(2)
+    return [
+        _count(
+            orientations, target_px, target, grid,
+            Pose(transforms.yaw_of(T[:3, :3]), float(T[0, 3]), float(T[1, 3])), origin, tolerance, 0,
+        )
+        for T in poses
+    ]  # fmt: skip
+
+
 def strengths_of(voted: Sequence[VotedPose]) -> list[float]:
-    """Return how many pairs agree on each pose, less the two that agree on any."""
-    return [float(max(len(one.found) - 2, 0)) for one in voted]
+    """Return the strength of each pose."""
+    return [one.strength for one in voted]
 
 
 def _peaks(
@@ -204,11 +256,14 @@ def _count(
     pose: Pose,
     middle: Floats,
     tolerance: float,
+    rounds: int = ROUNDS,
 ) -> VotedPose:
     """Fit a pose to the candidates near it, and count those that agree one to one."""
     yaw = pose.yaw
     shift = np.array([pose.east, pose.north]) - transforms.yaw_matrix(yaw)[:2, :2] @ middle
     near = [one for one in orientations if angle_between(one.turn, yaw) <= np.radians(TOLERATED_DEG)]
+    # a pose that was fitted elsewhere may lie just beyond the only orientation
+    near = near or [min(orientations, key=lambda one: angle_between(one.turn, yaw))]
     k = [one.partner.shape[1] for one in near]
     s = np.concatenate([np.repeat(one.source, n, axis=0) for one, n in zip(near, k, strict=True)])
     s_px = np.concatenate([np.repeat(one.source_px, n, axis=0) for one, n in zip(near, k, strict=True)])
@@ -218,7 +273,7 @@ def _count(
     T = transforms.compose(transforms.yaw_matrix(yaw), np.append(shift, 0.0))
     reach = 2.0 * tolerance
     agreeing = np.zeros(len(s), bool)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         gap = np.hypot(*(s @ T[:2, :2].T + T[:2, 3] - t).T)
         now = gap < reach
         if now.sum() < 2 or (reach == tolerance and (now == agreeing).all()):

@@ -20,11 +20,11 @@ from mtpcr_geo.core.types import Bev, Look, Matches, TiePoints
 from mtpcr_geo.match.base import Features, PixelMatches, View, margin_of, one_to_one
 from mtpcr_geo.match.correlation import CorrelationSettings
 from mtpcr_geo.match.descriptors import NearestNeighbours, Orb, RootSift
-from mtpcr_geo.match.keypoints import magnified, turn_image
 from mtpcr_geo.match.learned.lightglue import LightGlue, normalised
 from mtpcr_geo.match.learned.model_cards import ExtractorFile, MatcherFile, descriptions
 from mtpcr_geo.match.learned.onnx import OnnxExtractor, Running, filled, tiles
 from mtpcr_geo.match.registry import KeypointSettings, make_matcher
+from mtpcr_geo.match.turning import magnified, turn_image
 from mtpcr_geo.method.focus import FocusSettings, Subject, focus, neighbourhood, overlap_share
 from mtpcr_geo.method.images import image_of
 from mtpcr_geo.registration import build_pipeline, read_options, register

@@ -7,8 +7,10 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
-WARM_UP = 0.05
-"""Share of the steps over which the learning rate rises."""
+WARM_UP, WARM_UP_STEPS = 0.05, 100
+"""Share of the steps over which the learning rate rises, and how many they are at most."""
+DECAY = 0.35
+"""Share of the steps, at the end, over which it falls."""
 
 
 class Curve:
@@ -48,9 +50,14 @@ class Curve:
 
 
 def learning_rate(highest: float, step: int, steps: int) -> float:
-    """Return the rate of a step: a linear rise, then half a cosine down to a hundredth."""
-    warm = max(1, round(WARM_UP * steps))
+    """Return the rate of a step: a linear rise, a plateau, then half a cosine down to a hundredth.
+
+    Before it falls the rate does not depend on the number of steps, so that a training that has not come so
+    far may be made longer (Haegele et al. 2024, arXiv:2405.18392).
+    """
+    warm = min(max(1, round(WARM_UP * steps)), WARM_UP_STEPS)
     if step < warm:
         return highest * (step + 1) / warm
-    left = (step - warm) / max(1, steps - warm)
-    return highest * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * left)))
+    falling = max(1, round(DECAY * steps))
+    gone = max(0.0, (step - (steps - falling)) / falling)
+    return highest * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * gone)))

@@ -30,8 +30,14 @@ def export(features: BevPoint, matcher: BevGlue, folder: Path) -> list[Path]:
         (torch.rand(1, 1, 64, 96), torch.tensor([32])),
         paths[0],
         ["image", "max_keypoints"],
-        ["keypoints", "scores", "descriptors"],
-        {"image": {2: "h", 3: "w"}, "keypoints": {1: "k"}, "scores": {1: "k"}, "descriptors": {1: "k"}},
+        ["keypoints", "scores", "descriptors", "map"],
+        {
+            "image": {2: "h", 3: "w"},
+            "keypoints": {1: "k"},
+            "scores": {1: "k"},
+            "descriptors": {1: "k"},
+            "map": {2: "rows", 3: "columns"},
+        },
     )
     places, described = (torch.rand(1, 24, 2), torch.rand(1, 20, 2)), (24, 20)
     vectors = [torch.nn.functional.normalize(torch.randn(1, n, DESCRIPTOR_DIM), dim=2) for n in described]

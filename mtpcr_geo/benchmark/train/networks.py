@@ -21,14 +21,19 @@ SCALE_PX = 256.0
 """Pixels that the matcher takes for one unit of length."""
 
 
-def _block(inside: int, outside: int, stride: int = 1) -> Any:
+def _block(inside: int, outside: int, stride: int = 1, dilation: int = 1) -> Any:
     return nn.Sequential(
-        nn.Conv2d(inside, outside, 3, stride, 1, bias=False), nn.BatchNorm2d(outside), nn.ReLU(inplace=True)
+        nn.Conv2d(inside, outside, 3, stride, dilation, dilation, bias=False),
+        nn.BatchNorm2d(outside),
+        nn.ReLU(inplace=True),
     )
 
 
 class BevPoint(nn.Module):
     """Keypoints and descriptors of an image: a shared trunk to an eighth of the resolution, and two heads.
+
+    The last convolutions are dilated, so that a descriptor sees 109 pixels about its place: one corner of a
+    roof is like another, and what stands round it is not.
 
     Args:
         width: channels of the trunk at its end.
@@ -45,10 +50,10 @@ class BevPoint(nn.Module):
             _block(64, 64),
             _block(64, width, 2),
             _block(width, width),
-            _block(width, width),
+            _block(width, width, dilation=2),
         )
         self.detector = nn.Sequential(_block(width, width), nn.Conv2d(width, CELL_PX**2 + 1, 1))
-        self.descriptor = nn.Sequential(_block(width, width), nn.Conv2d(width, DESCRIPTOR_DIM, 1))
+        self.descriptor = nn.Sequential(_block(width, width, dilation=2), nn.Conv2d(width, DESCRIPTOR_DIM, 1))
 
     def forward(self, image: Any) -> tuple[Any, Any]:
         """Return (b, 65, h/8, w/8) logits of the cells and (b, d, h/8, w/8) descriptors, not normalised.
@@ -76,14 +81,17 @@ def sample_descriptors(maps: Any, px: Any) -> Any:
 
 
 class Extractor(nn.Module):
-    """The extractor's graph of the package's contract: image, max_keypoints in; keypoints with scores out."""
+    """The extractor's graph of the package's contract, which gives the map of descriptors too."""
 
     def __init__(self, network: BevPoint) -> None:
         super().__init__()
         self.network = network
 
-    def forward(self, image: Any, max_keypoints: Any) -> tuple[Any, Any, Any]:
-        """Return (1, k, 2) pixels, (1, k) scores and (1, k, d) descriptors, best first."""
+    def forward(self, image: Any, max_keypoints: Any) -> tuple[Any, Any, Any, Any]:
+        """Return (1, k, 2) pixels, (1, k) scores and (1, k, d) descriptors, best first, and the map.
+
+        The map is (1, d, h/8, w/8), of unit length.
+        """
         logits, maps = self.network(image)
         found = heatmap(logits)
         peaks = found == F.max_pool2d(found[:, None], 2 * NMS_RADIUS + 1, 1, NMS_RADIUS)[:, 0]
@@ -91,7 +99,7 @@ class Extractor(nn.Module):
         scores, index = torch.topk(flat, max_keypoints[0], dim=1)
         width = image.shape[-1]
         px = torch.stack([index % width, torch.div(index, width, rounding_mode="floor")], 2).to(image.dtype)
-        return px, scores, sample_descriptors(maps, px)
+        return px, scores, sample_descriptors(maps, px), F.normalize(maps, dim=1)
 
 
 def _rotated(x: Any, cosine: Any, sine: Any) -> Any:

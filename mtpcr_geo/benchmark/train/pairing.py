@@ -64,7 +64,7 @@ def keypoints_of(extractor: Extractor, sample: Sample, count: int) -> Keypoints:
     with torch.no_grad():
         for image in sample.images:
             grey = torch.from_numpy(image).float()[None, None] / 255
-            found, _, described = extractor(grey, most)
+            found, _, described, _ = extractor(grey, most)
             px.append(found[0])
             descriptors.append(described[0])
     known = partners(px[0].numpy().astype(np.float64), px[1].numpy().astype(np.float64), sample.M)

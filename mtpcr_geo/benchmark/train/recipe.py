@@ -40,17 +40,17 @@ class Recipe:
     """
 
     seed: int = 0
-    sites: int = 21
-    draws: int = 4
-    feature_steps: int = 1200
+    sites: int = 63
+    draws: int = 6
+    feature_steps: int = 20000
     batch: int = 8
-    size: int = 96
-    width: int = 96
+    size: int = 128
+    width: int = 128
     matcher_pairs: int = 600
     matcher_epochs: int = 6
     matcher_size: int = 256
     keypoints: int = 256
-    threads: int = 1
+    threads: int = 2
     device: str = "auto"
     precision: str = "bfloat16"
 

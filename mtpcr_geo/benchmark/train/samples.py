@@ -14,13 +14,15 @@ from mtpcr_geo.benchmark.train.views import View
 from mtpcr_geo.core.arrays import Floats, Grey
 from mtpcr_geo.method.images import EMPTY_GREY
 
-ROTATION_DEG = 30.0
+ROTATION_DEG = 25.0
 """Rotation between the patches of a pair at most; the sweep of orientations leaves 22.5 degrees."""
-CELL_RATIO = 1.7
-"""Ratio of the cells of two views at most."""
-SHARES = {"across": 0.6, "alike": 0.4}
-"""Share of pairs of a ground view with an aerial one, and of two views of one kind."""
-POINTS = 96
+CELL_RATIOS = {1.12: 0.75, 1.7: 0.25}
+"""Ratio of the cells of two views at most, and the share of pairs drawn with it."""
+ACROSS_SHARE = 0.7
+"""Share of pairs of a ground view with an aerial one; the others are two views of one kind."""
+LARGEST_STRETCH = 0.06
+"""Natural logarithm of the factor at most by which a patch is cut larger or smaller than its cell says."""
+POINTS = 128
 """Correspondences of a pair."""
 PEAK_RADIUS = 4
 LEAST_PEAK = 0.15
@@ -67,20 +69,21 @@ def choose_views(views: Sequence[View], rng: np.random.Generator) -> tuple[View,
     """Draw two views of like cells, from the ground and from the air or both of a kind."""
     while True:
         first = views[int(rng.integers(len(views)))]
-        across = rng.random() < SHARES["across"]
+        across = rng.random() < ACROSS_SHARE
+        ratio = float(rng.choice(list(CELL_RATIOS), p=list(CELL_RATIOS.values())))
         others = [
             view
             for view in views
             if view is not first
             and (view.from_ground != first.from_ground) == across
-            and max(view.cell / first.cell, first.cell / view.cell) < CELL_RATIO
+            and max(view.cell / first.cell, first.cell / view.cell) < ratio
         ]
         if others:
             return first, others[int(rng.integers(len(others)))]
 
 
 def draw_sample(
-    views: Sequence[View], rng: np.random.Generator, size: int, *, shift: float = 0.2, tries: int = 20
+    views: Sequence[View], rng: np.random.Generator, size: int, *, shift: float = 0.2, tries: int = 8
 ) -> Sample:
     """Cut two patches of one place, turned, scaled and shifted against each other, and spoil them.
 
@@ -98,23 +101,38 @@ def draw_sample(
     mirrored = rng.random() < 0.5
     sample = None
     for _ in range(tries):
-        middle = one.places[int(rng.integers(len(one.places)))]
+        middle = _common_place(one, other, rng)
         turn = rng.uniform(0.0, 2 * np.pi)
         turns = turn, turn + np.radians(rng.uniform(-ROTATION_DEG, ROTATION_DEG))
         places = middle, middle + rng.uniform(-shift, shift, 2) * size * zoom * other.cell
         patches = []
         for view, angle, place in zip((one, other), turns, places, strict=True):
-            scale = zoom * view.cell * np.exp(rng.uniform(-0.12, 0.12))
+            scale = zoom * view.cell * np.exp(rng.uniform(-LARGEST_STRETCH, LARGEST_STRETCH))
             A = _patch_to_site(size, angle, scale, place, mirrored)
             patches.append((*_cut(view, A, size), A))
         (a, filled_a, A), (b, filled_b, B) = patches
         M = _compose(_inverse(B), A)
         sample = Sample((a, b), (filled_a, filled_b), M)
-        shared = _warp(filled_b.astype(np.uint8), M, size, 0) & filled_a
-        if shared.mean() > 0.15 and a.std() > 4.0 and b.std() > 4.0:
+        # a thinned cloud fills few of the pixels that it covers
+        covered = [
+            cv2.dilate(filled.astype(np.uint8), np.ones((7, 7), np.uint8)) for filled in (filled_a, filled_b)
+        ]
+        shared = _warp(covered[1], M, size, 0) & covered[0]
+        if shared.mean() > 0.25 and a.std() > 4.0 and b.std() > 4.0:
             break
     assert sample is not None
     return spoil(sample, rng)
+
+
+def _common_place(one: View, other: View, rng: np.random.Generator) -> Floats:
+    """Draw a place of a view, in the site's frame, that the other has filled too, if there soon is one."""
+    places = one.places[rng.integers(len(one.places), size=32)]
+    px = np.rint(_apply(other.to_pixel, places)).astype(np.int64)
+    height, width = other.filled.shape
+    inside = np.asarray((px >= 0).all(axis=1) & (px < [width, height]).all(axis=1))
+    column, row = np.where(inside[:, None], px, 0).T
+    both = other.filled[row, column] & inside
+    return np.asarray(places[int(np.argmax(both))])
 
 
 def spoil(sample: Sample, rng: np.random.Generator) -> Sample:

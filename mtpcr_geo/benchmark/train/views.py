@@ -18,9 +18,14 @@ from mtpcr_geo.method.images import band_image
 FINEST_CELL_M, COARSEST_CELL_M = 0.3, 1.6
 LEAST_KEPT = 0.08
 """Smallest share of a cloud's points that thinning keeps."""
+LEAST_PER_CELL = 1.0
+"""Points in a filled cell, on average, below which a cloud is not thinned: a registration takes coarser cells
+for so few."""
 LARGEST_NOISE_M = 0.08
-DRAWS = 4
+DRAWS = 6
 """Cells at which each cloud is rasterised."""
+CELL_SPREAD = 0.05
+"""Natural logarithm of the factor at most by which the cells of the clouds of a site differ in one draw."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,9 @@ class View:
 
 
 def views_of(site: Site, seed: int = 0, draws: int = DRAWS) -> list[View]:
-    """Rasterise each cloud of a site `draws` times: cell, yaw, density and noise drawn anew.
+    """Rasterise each cloud of a site `draws` times: yaw, density and noise drawn anew.
+
+    In each draw all clouds have nearly one cell, as a pair has in a registration.
 
     Args:
         site: the clouds.
@@ -67,19 +74,23 @@ def views_of(site: Site, seed: int = 0, draws: int = DRAWS) -> list[View]:
         `draws` views for each cloud.
 
     """
+    # one draw in each part of the range, so that every cloud is seen fine and coarse
+    edges = np.linspace(np.log(FINEST_CELL_M), np.log(COARSEST_CELL_M), draws + 1)
+    shared = np.random.default_rng([seed, *site.name.encode()])
+    cells = [float(shared.uniform(low, high)) for low, high in pairwise(edges)]
     made = []
     for number, (instrument, points) in enumerate(sorted(site.clouds.items())):
         rng = np.random.default_rng([seed, number, *site.name.encode()])
-        # one draw in each part of the range, so that every cloud is seen fine and coarse
-        edges = np.linspace(np.log(FINEST_CELL_M), np.log(COARSEST_CELL_M), draws + 1)
-        for low, high in pairwise(edges):
-            cell = float(np.exp(rng.uniform(low, high)))
+        for middle in cells:
+            cell = float(np.exp(middle + rng.uniform(-CELL_SPREAD, CELL_SPREAD)))
             made.append(_view(instrument, points, cell, rng))
     return made
 
 
 def _view(instrument: str, points: Points, cell: float, rng: np.random.Generator) -> View:
-    kept = float(np.exp(rng.uniform(np.log(LEAST_KEPT), 0.0)))
+    covered = len(np.unique(np.floor(points[:, :2]).astype(np.int64), axis=0))
+    least = LEAST_PER_CELL / (len(points) / covered * cell**2)
+    kept = float(np.exp(rng.uniform(np.log(np.clip(least, LEAST_KEPT, 1.0)), 0.0)))
     xyz = points[rng.random(len(points)) < kept].astype(np.float64)
     xyz += rng.normal(0.0, rng.uniform(0.0, LARGEST_NOISE_M), xyz.shape)
     yaw = float(rng.uniform(0.0, 2 * np.pi))

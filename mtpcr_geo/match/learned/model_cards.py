@@ -60,12 +60,19 @@ class ExtractorFile(_Part):
         description="partners of a keypoint, by descriptors of unit length, that vote for a pose; 0 for "
         "poses by consensus of the matches alone",
     )
+    map_stride: int = Field(
+        0,
+        ge=0,
+        le=64,
+        description="the graph has an output map, (1, d, h / stride, w / stride) descriptors of unit length "
+        "of all places, by which poses are proposed; 0 if it has none",
+    )
     channels: Literal[1, 3] = Field(1, description="grey, or grey three times over")
     mean: float = Field(0.0, description="taken from grey / 255 before the graph sees it")
     std: float = Field(1.0, gt=0, description="by which the rest is divided")
     names: dict[str, str] = Field(
         {}, description="the graph's own names where they differ: image, max_keypoints, keypoints, scores, "
-        "descriptors"
+        "descriptors, map"
     )  # fmt: skip
 
 

@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core.arrays import Grey
 from mtpcr_geo.core.errors import InputError, MissingPartError
-from mtpcr_geo.match.base import Features
+from mtpcr_geo.match.base import DescribedPlaces, Features
 from mtpcr_geo.match.learned.model_cards import ExtractorFile
 
 Device = Literal["auto", "cpu", "cuda"]
 
 OVERLAP_PX = 64
 """By how much tiles overlap: networks see some tens of pixels around a keypoint."""
+LEAST_SHOWN = 0.1
+"""Share of the pixels of a place that must not be empty, for its descriptor to count."""
 
 
 @dataclass(frozen=True)
@@ -139,9 +141,8 @@ class OnnxExtractor:
         self.model = model
         self.max_keypoints = max_keypoints or model.max_keypoints
         self.tile = _multiple(max(tile or model.tile, 2 * OVERLAP_PX), model.size_multiple)
-        self.graph = Graph(
-            path, ("image", "max_keypoints"), ("keypoints", "scores", "descriptors"), model.names, running
-        )
+        outputs = ("keypoints", "scores", "descriptors", *(["map"] if model.map_stride else []))
+        self.graph = Graph(path, ("image", "max_keypoints"), outputs, model.names, running)
 
     def extract(self, image: Grey, empty: int = 0) -> Features:
         """Find keypoints in a (h, w) uint8 image, padded by ``empty``; descriptors are float32."""
@@ -153,7 +154,15 @@ class OnnxExtractor:
         score = np.concatenate([part.score for part in parts])
         order = np.lexsort((px[:, 1], px[:, 0], -score))[: self.max_keypoints]
         descriptors = np.concatenate([part.descriptors for part in parts])
-        return Features(px[order], score[order], descriptors[order])
+        seen = [part.places for part in parts if part.places is not None]
+        places = None
+        if self.model.map_stride:
+            places = DescribedPlaces(
+                np.concatenate([np.empty((0, 2)), *(part.px for part in seen)]),
+                np.concatenate([self._none().descriptors, *(part.descriptors for part in seen)]),
+                float(self.model.map_stride),
+            )
+        return Features(px[order], score[order], descriptors[order], places)
 
     def _of_tile(
         self, image: Grey, empty: int, column: int, row: int, core: tuple[int, int, int, int]
@@ -173,7 +182,7 @@ class OnnxExtractor:
         )
         padded[:height, :width] = part
         wanted = min(self.max_keypoints, padded.size)
-        px, score, descriptors = self.graph.run(
+        px, score, descriptors, *maps = self.graph.run(
             image=as_input(padded, self.model.channels, self.model.mean, self.model.std),
             max_keypoints=np.array([wanted], np.int64),
         )
@@ -183,7 +192,26 @@ class OnnxExtractor:
         keep = score > self.model.score_threshold
         keep &= (px[:, 0] <= width - 0.5) & (px[:, 1] <= height - 0.5) & np.isfinite(descriptors).all(axis=1)
         keep &= (x >= west - 0.5) & (x < east - 0.5) & (y >= north - 0.5) & (y < south - 0.5)
-        return Features(np.column_stack([x, y])[keep], score[keep], descriptors[keep])
+        places = self._places(maps[0], padded, empty) if maps else None
+        if places is not None:
+            at = places.px + [column, row]
+            own = (at >= [west - 0.5, north - 0.5]).all(axis=1) & (at < [east - 0.5, south - 0.5]).all(axis=1)
+            places = DescribedPlaces(at[own], places.descriptors[own], places.step_px)
+        return Features(np.column_stack([x, y])[keep], score[keep], descriptors[keep], places)
+
+    def _places(self, described: NDArray[Any], image: Grey, empty: int) -> DescribedPlaces:
+        """Take the places of a map under which the image shows something, in pixels of the image."""
+        step = self.model.map_stride
+        rows, columns = image.shape[0] // step, image.shape[1] // step
+        if described.shape != (1, self.model.descriptor_dim, rows, columns):
+            raise InputError(
+                f"{self.graph.path} gives a map {described.shape}; wanted is "
+                f"(1, {self.model.descriptor_dim}, {rows}, {columns})"
+            )
+        shown = (image != empty)[: rows * step, : columns * step].reshape(rows, step, columns, step)
+        row, column = np.nonzero(shown.mean(axis=(1, 3)) > LEAST_SHOWN)
+        px = np.stack([column, row], axis=1).astype(np.float64) * step + (step - 1) / 2
+        return DescribedPlaces(px, described[0][:, row, column].T.astype(np.float32), float(step))
 
     def _checked(
         self, px: NDArray[Any], score: NDArray[Any], descriptors: NDArray[Any]
