@@ -87,7 +87,7 @@ def _match(
         twin = Exploration(
             mirrored, target, scales, settings, seed, advance, null, search, MIRRORED_HYPOTHESES
         )
-    for step in steps_of(search_factors(source, target), settings.proposals is not None and prior is None):
+    for step in steps_of(search_factors(source, target)):
         if not search.explore(step):
             continue
         settled = search.settles()

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal, Protocol
 
 import numpy as np
 
-from mtpcr_geo.core.types import Bev, Hypothesis
+from mtpcr_geo.core.types import Bev
 from mtpcr_geo.match.candidates import Candidate, Pool, same_pose
 from mtpcr_geo.match.descent import comb, comb_each, follow
 from mtpcr_geo.match.judge import CLEAR_MARGIN, Judge
@@ -62,7 +61,6 @@ class CorrelationSettings:
             alike have given 11 to a pose 120 m off, where the true one had 48.
         mirrored_null: search the mirrored source too.
         trust_vertical: whether both verticals are known, so that the terrains may differ by a shift alone.
-        proposals: who proposes further poses where the search does not settle; None for nobody.
 
     """
 
@@ -75,14 +73,6 @@ class CorrelationSettings:
     convincing_neg_log10_p: float = 20.0
     mirrored_null: bool = True
     trust_vertical: bool = True
-    proposals: Proposals | None = None
-
-
-class Proposals(Protocol):
-    """Proposes poses by other means than the search's own."""
-
-    def poses(self, source: Bev, target: Bev) -> list[Hypothesis]:
-        """Propose poses of the source over the target, best first."""
 
 
 @dataclass(frozen=True)
@@ -92,30 +82,22 @@ class Step:
     Attributes:
         factor: the level's cell as a multiple of the finest.
         part: 0 for the level's best hypotheses, 1 for its others.
-        by: what proposes: height and step edges (the channels of the search), the terrain, or
-            `CorrelationSettings.proposals`.
+        by_terrain: propose by the terrain, instead of by height and step edges.
 
     """
 
     factor: int
     part: int
-    by: Literal["channels", "terrain", "proposals"] = "channels"
-
-    @property
-    def by_terrain(self) -> bool:
-        """Return whether the terrain proposes."""
-        return self.by == "terrain"
+    by_terrain: bool = False
 
 
-def steps_of(factors: list[int], proposals: bool = False) -> Iterator[Step]:
-    """Give the steps of a search in order; the terrain and other proposals are asked on the first level."""
+def steps_of(factors: list[int]) -> Iterator[Step]:
+    """Give the steps of a search in order; the terrain is asked on the first level."""
     for number, factor in enumerate(factors):
         for part in (0, 1):
             yield Step(factor, part)
             if number == 0:
-                yield Step(factor, part, "terrain")
-                if proposals and part == 0:
-                    yield Step(factor, part, "proposals")
+                yield Step(factor, part, by_terrain=True)
 
 
 class Exploration:
@@ -176,9 +158,7 @@ class Exploration:
         first = not self.done
         self.done.append(step)
         known = max([known, *self.pool.strengths[:1]])
-        if step.by == "proposals":
-            poses, bound = self._by_proposals(step), 0.0
-        elif step.by_terrain:
+        if step.by_terrain:
             poses, bound = self._by_terrain(step)
         else:
             poses, bound = self._by_channels(step, known)
@@ -190,7 +170,7 @@ class Exploration:
         now, left = self.judge.judge(poses, known)
         self.judged += now
         self._rank(max(self.pool.bound, bound, left))
-        if self.pool.candidates and (step.by != "channels" or self.repeats()):
+        if self.pool.candidates and (step.by_terrain or self.repeats()):
             self._comb_about_the_best(known)
         return True
 
@@ -213,27 +193,15 @@ class Exploration:
     def _by_terrain(self, step: Step) -> tuple[list[Pose], float]:
         """Return what the terrains propose, at the finest cells, without what the channels had proposed."""
         share, count = (2, MORE_TERRAIN_HYPOTHESES) if step.part else (1, TERRAIN_HYPOTHESES)
-        proposed = self._propose_by_terrain(
-            self.scales.terrain_cell_m / share, count, COARSEST_YAW_STEP_DEG / share
-        )
-        return self._nearby(step.factor, self._others(proposed)), 0.0
-
-    def _by_proposals(self, step: Step) -> list[Pose]:
-        """Return what others propose, at the finest cells, without what the channels had proposed."""
-        proposals = self.settings.proposals
-        assert proposals is not None
-        centre = centre_of(self.pyramid.source.grid)
-        found = [pose_of(one, centre) for one in proposals.poses(self.pyramid.source, self.pyramid.target)]
-        return self._nearby(step.factor, self._others(found))
-
-    def _others(self, poses: list[Pose]) -> list[Pose]:
-        """Keep the poses that are none of those that the channels had proposed."""
         near, radius = self.scales.same_pose_m / 2, self.scales.extent_m / 2
-        return [
+        others = [
             pose
-            for pose in poses
+            for pose in self._propose_by_terrain(
+                self.scales.terrain_cell_m / share, count, COARSEST_YAW_STEP_DEG / share
+            )
             if not any(same_pose(pose, other, near, radius) for other in self._followed)
         ]
+        return self._nearby(step.factor, others), 0.0
 
     def _nearby(self, factor: int, poses: list[Pose]) -> list[Pose]:
         """Return the best places near poses that are some metres off, followed down and combed for.

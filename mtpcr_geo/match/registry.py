@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import Matches
 from mtpcr_geo.match.base import Advance, ImageMatcher, Matcher, View
 from mtpcr_geo.match.correlation import CorrelationSettings
@@ -15,9 +14,6 @@ from mtpcr_geo.match.descriptors import Extractor, FeatureMatcher, NearestNeighb
 from mtpcr_geo.match.keypoints import KeypointMatcher
 from mtpcr_geo.match.learned.model_cards import ModelDescription, descriptions, models_folder, path_of
 from mtpcr_geo.match.prior import Prior
-
-if TYPE_CHECKING:
-    from mtpcr_geo.match.learned.proposals import LearnedProposals
 
 BUILT_IN = ("correlation", "rootsift", "orb")
 RATIO = 0.9
@@ -118,29 +114,6 @@ def make_matcher(name: str, correlation: CorrelationSettings, keypoints: Keypoin
         sweep_keypoints=model.matcher.sweep_keypoints if model.matcher else None,
         candidates=model.extractor.candidates if model.extractor else 0,
     )
-
-
-def learned_proposals(settings: KeypointSettings, name: str = "bev") -> LearnedProposals:
-    """Make what proposes poses to the correlation search; its files are opened once it is asked.
-
-    Args:
-        settings: folder of models, device, threads.
-        name: of a model that describes all places of an image (`map_stride`).
-
-    """
-    from mtpcr_geo.match.learned.proposals import LearnedProposals
-
-    def opened() -> Extractor:
-        from mtpcr_geo.match.learned.onnx import OnnxExtractor, Running
-
-        folder = models_folder(settings.models)
-        model = descriptions(folder)[name]
-        assert model.extractor is not None and model.extractor.map_stride
-        # one thread for each orientation, so that no sum depends on how many there are
-        path = path_of(model.extractor.file, model, folder)
-        return OnnxExtractor(model.extractor, path, Running(settings.device, 1), tile=settings.tile)
-
-    return LearnedProposals(opened, settings.threads or usable_cores())
 
 
 def _classical(name: str, settings: KeypointSettings) -> ImageMatcher:

@@ -80,7 +80,7 @@ class VotedPose:
 
     @property
     def strength(self) -> float:
-        """Return how many pairs agree, less the two that always do, times the likelihood where it was asked."""
+        """Return how many pairs agree, less the two that always do, times the likelihood if known."""
         return self._weight * max(len(self.found) - 2.0, 0.0)
 
     @property

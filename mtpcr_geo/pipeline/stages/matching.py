@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mtpcr_geo.match.base import Matcher, View
     from mtpcr_geo.match.prior import Prior
 
-_FOR_CORRELATION = {"yaw_step", "patch", "search_radius", "min_overlap", "proposals"}
+_FOR_CORRELATION = {"yaw_step", "patch", "search_radius", "min_overlap"}
 _FOR_KEYPOINTS = {
     "models", "turns", "tolerance", "max_keypoints", "tile", "ratio", "cross_check", "device", "threads",
 }  # fmt: skip
@@ -99,11 +99,6 @@ class MatchOptions(PriorOptions, StageOptions):
         True,
         description="where a vertical is not known and the matches under the likeliest one do not convince: "
         "level, rasterise and match again under others, and keep the strongest",
-    )
-    proposals: bool = Field(
-        False,
-        description="where neither heights nor terrain settle the search: let the network of the matcher bev "
-        "propose further poses, which are judged like all others",
     )
     models: Models = None
     turns: int = Field(
@@ -223,22 +218,15 @@ class Match(Stage):
 
     def _make(self, prior: Prior | None, trust_vertical: bool = True) -> Matcher:
         from mtpcr_geo.match.correlation import CorrelationSettings
-        from mtpcr_geo.match.registry import (
-            CorrelationMatcher,
-            KeypointSettings,
-            learned_proposals,
-            make_matcher,
-        )
+        from mtpcr_geo.match.registry import CorrelationMatcher, KeypointSettings, make_matcher
 
         o = self.options
-        threads = o.threads or core_limit()
         correlation = CorrelationSettings(
             yaw_step_deg=o.yaw_step,
             patch_m=o.patch,
             search_radius_m=o.search_radius,
             min_overlap_m2=o.min_overlap,
             trust_vertical=trust_vertical,
-            proposals=learned_proposals(KeypointSettings(threads=threads)) if o.proposals else None,
         )
         if o.method == "correlation":
             return CorrelationMatcher(correlation, prior)
@@ -251,7 +239,7 @@ class Match(Stage):
             ratio=o.ratio,
             cross_check=o.cross_check,
             device=o.device,
-            threads=threads,
+            threads=o.threads or core_limit(),
         )
         return make_matcher(o.method, correlation, keypoints)
 
