@@ -80,17 +80,17 @@ class VotedPose:
 
     @property
     def strength(self) -> float:
-        """Return how many pairs agree, less the two that always do, times the likelihood if known."""
-        return self._weight * max(len(self.found) - 2.0, 0.0)
+        """Return how many pairs agree, less the two that always do; its geometric mean with a likelihood."""
+        return self._weighed(max(len(self.found) - 2.0, 0.0))
 
     @property
     def as_rival(self) -> float:
         """Return the strength that another pose is held against: of a handful of pairs one more is chance."""
-        return self._weight * max(len(self.found) - 2.0, LEAST_STRENGTH)
+        return self._weighed(max(len(self.found) - 2.0, LEAST_STRENGTH))
 
-    @property
-    def _weight(self) -> float:
-        return 1.0 if self.likelihood is None else self.likelihood
+    def _weighed(self, agreeing: float) -> float:
+        # the mean, so that a margin of these is one like those of other matchers
+        return agreeing if self.likelihood is None else float(np.sqrt(agreeing * self.likelihood))
 
 
 def agreeing_keypoints(one: Candidates, T: Floats, target: Floats, tolerance: float) -> int:
