@@ -19,7 +19,7 @@ from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Hypothesis, Matches
 from mtpcr_geo.match.base import Advance, Features, ImageMatcher, PixelMatches, View, margin_of, one_to_one
-from mtpcr_geo.match.likelihood import TurnedPlaces, poses_by_likelihood
+from mtpcr_geo.match.likelihood import TurnedPlaces, nearest_places, poses_by_likelihood
 from mtpcr_geo.match.search import angle_between
 from mtpcr_geo.match.turning import NOT_TURNED, ZOOM, affine, magnified, places_on_ground, shrunk, turn_image
 from mtpcr_geo.match.votes import (
@@ -208,6 +208,7 @@ class KeypointMatcher:
         yaw = transforms.yaw_of(best.T[:3, :3])
         nearest = min(range(len(turns)), key=lambda k: angle_between(turns[k], yaw))
         own = turned[nearest].match(self.images, prepared, zoom)
+        own = _with_places(own, turned[nearest], prepared[0], frame)
         found = one_to_one(
             PixelMatches(
                 np.concatenate([best.found.source_px, own.source_px]),
@@ -330,6 +331,23 @@ def _posed(
     agreeing = votes_for([one.T for one in found], orientations, target_px, frame.target, frame.tolerance)
     weighed = [replace(one, likelihood=pose.strength) for one, pose in zip(agreeing, found, strict=True)]
     return sorted(weighed, key=lambda one: -one.strength)[:KEPT]
+
+
+def _with_places(own: PixelMatches, turned: _Turned, target: Features, frame: _Frame) -> PixelMatches:
+    """Add the pairs of places that are each other's nearest, where the network describes all places."""
+    seen = cast(Features, turned.prepared[0]).places
+    if seen is None or target.places is None:
+        return own
+    source = places_on_ground(seen, turned.back, frame.zoom, frame.source)
+    whole = places_on_ground(target.places, NOT_TURNED, frame.zoom, frame.target)
+    index, at, likeness = nearest_places(source, whole)
+    return PixelMatches(
+        np.concatenate([own.source_px, frame.source.to_pixel(source.at[index])]),
+        np.concatenate([own.target_px, frame.target.to_pixel(at)]),
+        np.concatenate([own.score, np.clip(likeness, 0.0, 1.0)]),
+        own.source_keypoints,
+        own.target_keypoints,
+    )
 
 
 def _judge(
