@@ -144,11 +144,14 @@ def poses_by_likelihood(
         found += [(pose, number) for pose in _peaks(one, pairs[-1], target, middle, half)]
     found.sort(key=lambda peak: -peak[0].score)
     of = dict(found)
-    kept = distinct(of, most, np.radians(APART_DEG), APART_STEPS * target.step_m)
-    return [
-        LikelyPose(_fitted(pose, seen[of[pose]].places, pairs[of[pose]], target, middle), pose.score)
-        for pose in kept
-    ]
+    turned, apart = np.radians(APART_DEG), APART_STEPS * target.step_m
+    fitted: dict[Pose, Floats] = {}
+    for pose in distinct(of, most, turned, apart):
+        T = _fitted(pose, seen[of[pose]].places, pairs[of[pose]], target, middle)
+        east, north = T[:2, :2] @ middle + T[:2, 3]
+        fitted[Pose(transforms.yaw_of(T[:3, :3]), float(east), float(north), pose.score)] = T
+    # neighbouring yaws may have come to one pose
+    return [LikelyPose(fitted[pose], pose.score) for pose in distinct(fitted, most, turned, apart)]
 
 
 def nearest_places(source: Places, target: Places) -> tuple[NDArray[np.int64], Floats, Floats]:
