@@ -11,6 +11,7 @@ import os
 import pickle
 import subprocess
 import sys
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -44,11 +45,12 @@ class RemoteWriter:
 
     def __init__(self, path: Path, budget: Budget, seed: int) -> None:
         self._path = path
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the process
         self._process = subprocess.Popen(
             [sys.executable, "-c", _START.format(path=sys.path)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
+            stderr=self._said,
             # what a terminal interrupts is the run; this one ends when the pipe does
             process_group=0 if os.name == "posix" else None,
         )
@@ -84,13 +86,19 @@ class RemoteWriter:
         except (OSError, EOFError, pickle.UnpicklingError) as error:
             raise OutputError(
                 f"cannot write the recording {self._path}: the process that makes it ended with "
-                f"{self._process.wait()}"
+                f"{self._process.wait()}{self._last_words()}"
             ) from error
         finally:
             self._process.wait()
+            self._said.close()
         if isinstance(made, Exception):
             raise made
         self._path.write_bytes(made)
+
+    def _last_words(self) -> str:
+        self._said.seek(0)
+        lines = self._said.read().decode(errors="replace").split("\n")
+        return next((f" ({line.strip()[:200]})" for line in reversed(lines) if line.strip()), "")
 
     def _say(self, *message: Any) -> None:
         assert self._process.stdin is not None
@@ -126,8 +134,8 @@ def serve() -> None:
                 getattr(writer, name)(*arguments)
     except EOFError:
         return  # the run is gone
-    except Exception as error:  # noqa: BLE001 - raised where the run waits for the reply
-        made = error
+    except BaseException as error:  # noqa: BLE001 - raised where the run waits; a panic of rerun is no Exception
+        made = error if isinstance(error, Exception) else RuntimeError(f"{type(error).__name__}: {error!s}")
         _skip_to_end(reader)
     with reply:
         reply.write(_reply(made))
@@ -138,7 +146,7 @@ def _skip_to_end(reader: pickle.Unpickler) -> None:
     try:
         while reader.load()[0] != "close":
             pass
-    except (EOFError, pickle.UnpicklingError):
+    except Exception:  # noqa: BLE001 - after an error in the middle of a message anything may come
         return
 
 
