@@ -42,8 +42,9 @@ PEAKS = 3
 """Shifts of most evidence that are kept of each yaw."""
 APART_DEG, APART_STEPS = 8.0, 4.0
 """Two poses are distinct where they turn, or move the middle of the source, apart by more than this."""
-MOST_PLACES = 4000
-"""Places of the source that are compared: of more, every so many-th."""
+MOST_PLACES, FEWEST_PLACES, MOST_PAIRS = 4000, 1000, 64_000_000
+"""Places of the source that are compared: of more, every so many-th, so that there are no more pairs with the
+target's places than memory has room for; but of a very large target as many as the second number."""
 BLOCK_PAIRS = 4_000_000
 """Pairs whose descriptors are compared at once."""
 ROUNDS = 4
@@ -131,7 +132,8 @@ def poses_by_likelihood(
         Distinct poses, those first for which most speaks.
 
     """
-    seen = [TurnedPlaces(one.turn, one.places.thinned(MOST_PLACES)) for one in orientations]
+    room = int(np.clip(MOST_PAIRS // max(len(target), 1), FEWEST_PLACES, MOST_PLACES))
+    seen = [TurnedPlaces(one.turn, one.places.thinned(room)) for one in orientations]
     seen = [one for one in seen if len(one.places)]
     if not seen or not len(target):
         return []

@@ -17,8 +17,8 @@ from mtpcr_geo.benchmark.train.networks import BevPoint, sample_descriptors
 from mtpcr_geo.benchmark.train.samples import Labels, Sample, draw_sample, label
 from mtpcr_geo.benchmark.train.views import View
 from mtpcr_geo.core.errors import MtpcrError
+from mtpcr_geo.match.likelihood import TEMPERATURE
 
-TEMPERATURE = 0.07
 NEAR_PX = 8.0
 """Places of a patch nearer than this are not told apart: they share cells of the descriptor's map."""
 DETECTOR_WEIGHT = 0.5
