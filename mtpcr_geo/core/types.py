@@ -217,6 +217,8 @@ class Matches(ComparesArrays):
         hypotheses: candidates in falling order of score; the first is the one the matches follow.
         search_radius_m: how far a match may lie from where the best hypothesis puts it, metres; None from
             matchers that search the whole raster.
+        by_chance: share of matches that agree under a pose that is surely wrong, and within how many metres;
+            None where that was not measured.
         margin: strength of the best hypothesis over the next distinct one; None where there is no telling.
         support: share of the patches in the overlap that agree on the pose; None likewise.
         strength: of the best hypothesis, score times support; None from matchers that have none.
@@ -236,6 +238,7 @@ class Matches(ComparesArrays):
     score: Floats
     hypotheses: tuple[Hypothesis, ...] = ()
     search_radius_m: float | None = None
+    by_chance: tuple[float, float] | None = None
     margin: float | None = None
     support: float | None = None
     null_ratio: float | None = None

@@ -19,7 +19,8 @@ from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Hypothesis, Matches
 from mtpcr_geo.match.base import Advance, Features, ImageMatcher, PixelMatches, View, margin_of, one_to_one
-from mtpcr_geo.match.likelihood import TurnedPlaces, nearest_places, poses_by_likelihood
+from mtpcr_geo.match.guided import agreeing_share, places_about, reach_m, within_reach
+from mtpcr_geo.match.likelihood import Places, TurnedPlaces, poses_by_likelihood
 from mtpcr_geo.match.search import angle_between
 from mtpcr_geo.match.turning import NOT_TURNED, ZOOM, affine, magnified, places_on_ground, shrunk, turn_image
 from mtpcr_geo.match.votes import (
@@ -176,9 +177,8 @@ class KeypointMatcher:
     ) -> Matches:
         """Find a pose by the candidates of all orientations.
 
-        The matches handed on are the pairs that agree on it, and all that the image matcher finds in the
-        nearest orientation, agreeing or not. The margin is over the next distinct pose and over the best of
-        the mirrored source, which looks alike and has no right pose.
+        The matches handed on are those of `_ties`. The margin is over the next distinct pose and over the
+        best of the mirrored source, which looks alike and has no right pose.
         """
         target_px = shrunk(prepared[0].px, zoom)
         frame = _Frame(source.grid, target.grid, zoom, tolerance)
@@ -205,20 +205,13 @@ class KeypointMatcher:
             frame,
         )
         best = voted[0]
-        yaw = transforms.yaw_of(best.T[:3, :3])
-        nearest = min(range(len(turns)), key=lambda k: angle_between(turns[k], yaw))
+        nearest = _nearest_turn(turns, best.T)
         own = turned[nearest].match(self.images, prepared, zoom)
-        own = _with_places(own, turned[nearest], prepared[0], frame)
-        found = one_to_one(
-            PixelMatches(
-                np.concatenate([best.found.source_px, own.source_px]),
-                np.concatenate([best.found.target_px, own.target_px]),
-                # what agrees with the pose goes before what does not
-                np.concatenate([0.5 + 0.5 * best.found.score, 0.5 * own.score]),
-                own.source_keypoints,
-                own.target_keypoints,
-            )
-        )
+        found = _ties(best, own, turned[nearest], prepared[0], frame)
+        chance = None
+        if mirrored:
+            opposite = others[_nearest_turn(turns, mirrored[0].T)]
+            chance = _chance(mirrored[0], opposite, prepared[0], frame)
         strengths, null = strengths_of(voted), strengths_of(mirrored)
         hypotheses = tuple(_hypothesis(one, value) for one, value in zip(voted, strengths, strict=True))
         rivals = [one.as_rival for one in (*voted[1:], *mirrored)]
@@ -239,6 +232,7 @@ class KeypointMatcher:
             "agreeing": len(best.found),
             "margin": margin,
             "tolerance_m": tolerance,
+            "agreeing_by_chance": chance,
             "keypoints": list(keypoints),
         }
         return Matches(
@@ -247,6 +241,7 @@ class KeypointMatcher:
             found.score,
             hypotheses,
             margin=margin,
+            by_chance=None if chance is None else (chance, tolerance),
             report=report,
             source_keypoints=found.source_keypoints,
             target_keypoints=found.target_keypoints,
@@ -321,33 +316,72 @@ def _posed(
     target_px = shrunk(target.px, frame.zoom)
     if target.places is None:
         return poses_by_votes(orientations, target_px, frame.target, frame.tolerance)
-    seen = []
-    for turn, one in zip(turns, turned, strict=True):
-        places = cast(Features, one.prepared[0]).places
-        assert places is not None  # the target's features have them, and come of the same graph
-        seen.append(TurnedPlaces(turn, places_on_ground(places, one.back, frame.zoom, frame.source)))
-    whole = places_on_ground(target.places, NOT_TURNED, frame.zoom, frame.target)
+    places = [_places_of(one, target, frame) for one in turned]
+    seen = [TurnedPlaces(turn, one) for turn, (one, _) in zip(turns, places, strict=True)]
+    whole = places[0][1]
     found = poses_by_likelihood(seen, whole, most=EXAMINED, yaw=turns[0] if len(turns) == 1 else None)
     agreeing = votes_for([one.T for one in found], orientations, target_px, frame.target, frame.tolerance)
     weighed = [replace(one, likelihood=pose.strength) for one, pose in zip(agreeing, found, strict=True)]
     return sorted(weighed, key=lambda one: -one.strength)[:KEPT]
 
 
-def _with_places(own: PixelMatches, turned: _Turned, target: Features, frame: _Frame) -> PixelMatches:
-    """Add the pairs of places that are each other's nearest, where the network describes all places."""
-    seen = cast(Features, turned.prepared[0]).places
-    if seen is None or target.places is None:
-        return own
-    source = places_on_ground(seen, turned.back, frame.zoom, frame.source)
-    whole = places_on_ground(target.places, NOT_TURNED, frame.zoom, frame.target)
-    index, at, likeness = nearest_places(source, whole)
-    return PixelMatches(
-        np.concatenate([own.source_px, frame.source.to_pixel(source.at[index])]),
-        np.concatenate([own.target_px, frame.target.to_pixel(at)]),
-        np.concatenate([own.score, np.clip(likeness, 0.0, 1.0)]),
-        own.source_keypoints,
-        own.target_keypoints,
+def _nearest_turn(turns: list[float], T: Floats) -> int:
+    yaw = transforms.yaw_of(T[:3, :3])
+    return min(range(len(turns)), key=lambda k: angle_between(turns[k], yaw))
+
+
+def _ties(
+    best: VotedPose, own: PixelMatches, turned: _Turned, target: Features, frame: _Frame
+) -> PixelMatches:
+    """Return what is matched about a pose, agreeing or not; about no more than its keypoints without a map.
+
+    Where the network describes all places, each is sought near its place under the pose, and what the image
+    matcher found farther off is left out. Else nothing tells where to seek: the keypoints that agree are
+    returned, and all of the image matcher's.
+    """
+    if target.places is None:
+        return one_to_one(
+            PixelMatches(
+                np.concatenate([best.found.source_px, own.source_px]),
+                np.concatenate([best.found.target_px, own.target_px]),
+                # what agrees with the pose goes before what does not
+                np.concatenate([0.5 + 0.5 * best.found.score, 0.5 * own.score]),
+                own.source_keypoints,
+                own.target_keypoints,
+            )
+        )
+    source, whole = _places_of(turned, target, frame)
+    pairs = places_about(source, whole, best.T)
+    s, t = frame.source.to_metres(own.source_px), frame.target.to_metres(own.target_px)
+    own = own.take(within_reach(s, t, best.T, reach_m(whole)))
+    return one_to_one(
+        PixelMatches(
+            np.concatenate([own.source_px, frame.source.to_pixel(source.at[pairs.index])]),
+            np.concatenate([own.target_px, frame.target.to_pixel(pairs.at)]),
+            np.concatenate([own.score, pairs.sure]),
+            own.source_keypoints,
+            own.target_keypoints,
+        )
     )
+
+
+def _places_of(turned: _Turned, target: Features, frame: _Frame) -> tuple[Places, Places]:
+    """Return the places of the source in one orientation, and those of the target."""
+    seen = cast(Features, turned.prepared[0]).places
+    assert seen is not None  # the target's features have them, and come of the same graph
+    assert target.places is not None
+    return (
+        places_on_ground(seen, turned.back, frame.zoom, frame.source),
+        places_on_ground(target.places, NOT_TURNED, frame.zoom, frame.target),
+    )
+
+
+def _chance(mirrored: VotedPose, turned: _Turned, target: Features, frame: _Frame) -> float | None:
+    """Return the share of places that agree with the mirrored source's best pose, which cannot be right."""
+    if target.places is None:
+        return None
+    source, whole = _places_of(turned, target, frame)
+    return agreeing_share(places_about(source, whole, mirrored.T), frame.tolerance)
 
 
 def _judge(

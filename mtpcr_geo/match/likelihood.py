@@ -21,7 +21,6 @@ import cv2
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
@@ -154,46 +153,6 @@ def poses_by_likelihood(
         fitted[Pose(transforms.yaw_of(T[:3, :3]), float(east), float(north), pose.score)] = T
     # neighbouring yaws may have come to one pose
     return [LikelyPose(fitted[pose], pose.score) for pose in distinct(fitted, most, turned, apart)]
-
-
-def nearest_places(source: Places, target: Places) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """Pair the places whose descriptors are each other's nearest, to a part of the step between places.
-
-    A place lies between others of the target: at the mean of the nearest and of those beside it, weighted by
-    the likelihood that each is the one.
-
-    Args:
-        source: the source's places.
-        target: the target's.
-
-    Returns:
-        (n,) indices into the source's places, (n, 2) where they lie in the target, metres, and (n,) cosines.
-
-    """
-    none = np.empty(0, np.int64), np.empty((0, 2)), np.empty(0)
-    if not len(source) or not len(target):
-        return none
-    rows = max(1, BLOCK_PAIRS // len(target))
-    forth = np.empty(len(source), np.int64)
-    back, most = np.zeros(len(target), np.int64), np.full(len(target), -np.inf, np.float32)
-    for first in range(0, len(source), rows):
-        likeness = source.descriptors[first : first + rows] @ target.descriptors.T
-        forth[first : first + rows] = likeness.argmax(axis=1)
-        own = likeness.argmax(axis=0)
-        best = likeness[own, np.arange(len(target))]
-        better = best > most
-        back[better], most[better] = own[better] + first, best[better]
-    mutual = np.flatnonzero(back[forth] == np.arange(len(source)))
-    if not len(mutual):
-        return none
-    partner = forth[mutual]
-    beside = cKDTree(target.at).query_ball_point(target.at[partner], 1.5 * target.step_m)
-    at = np.empty((len(mutual), 2))
-    for k, near in enumerate(beside):
-        likeness = target.descriptors[near] @ source.descriptors[mutual[k]] / TEMPERATURE
-        weight = np.exp(likeness - likeness.max(), dtype=np.float64)
-        at[k] = weight @ target.at[near] / weight.sum()
-    return mutual, at, most[partner].astype(np.float64)
 
 
 def _compared(source: Places, target: Places) -> _Pairs:

@@ -10,19 +10,21 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.statistics import chance_within
-from mtpcr_geo.core.types import Hypothesis, Pair, Rival, SolveSettings, TiePoints
+from mtpcr_geo.core.types import Hypothesis, Matches, Pair, Rival, SolveSettings, TiePoints
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.match.base import margin_of
 from mtpcr_geo.method.overlap import overlap_of
 from mtpcr_geo.method.scales import MAX_LEAST_OVERLAP_M2, ground_cell_for, scales_of, tolerance_for
 from mtpcr_geo.method.shortcomings import what_is_missing
 from mtpcr_geo.method.solve import solve_tie_points
+from mtpcr_geo.verdict.findings import UNBOUNDED_CHANCE
 from mtpcr_geo.verdict.further import with_further
 from mtpcr_geo.verdict.limits import Evidence
 from mtpcr_geo.verdict.null import null_probability
 
 GROUND_AGREES_M = 0.5
 UNBOUNDED_CELLS = 2.0
+MOST_CHANCE = 0.5
 FAR_TOLERANCES, FAR_TURN_DEG = 5.0, 5.0
 """Tolerances in plan, or turn, from which on another pose is another place and not the same a little off."""
 
@@ -62,7 +64,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
     evidence = Evidence(
         held_out=len(held_out),
         held_out_agreeing=int(agreeing.sum()),
-        chance=None if radius is None else chance_within(tolerance, radius),
+        chance=_chance(matches, tolerance),
         tolerance_m=tolerance,
         held_out_median_m=float(np.median(held_out[agreeing])) if agreeing.any() else None,
         margin=matches.margin if matches is not None else None,
@@ -105,6 +107,18 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         **further,
     }
     return evidence, more
+
+
+def _chance(matches: Matches | None, tolerance: float) -> float | None:
+    """Return how probably a held-out tie point agrees by chance; None where that is not known."""
+    if matches is None:
+        return None
+    if matches.search_radius_m is not None:
+        return chance_within(tolerance, matches.search_radius_m)
+    if matches.by_chance is None:
+        return None
+    share, within = matches.by_chance
+    return float(np.clip(share * (tolerance / within) ** 2, UNBOUNDED_CHANCE, MOST_CHANCE))
 
 
 def _agreeing_heights(pair: Pair, agreeing: Mask) -> dict[str, Any]:

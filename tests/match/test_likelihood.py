@@ -10,7 +10,6 @@ from mtpcr_geo.match.likelihood import (
     LEAST_LOG_RATIO,
     Places,
     TurnedPlaces,
-    nearest_places,
     poses_by_likelihood,
 )
 
@@ -117,27 +116,6 @@ def test_a_known_yaw_needs_one_orientation():
     assert off_by(best.T, T, one.places.at.mean(axis=0))[1] < STEP_M
 
 
-@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.6, 0.9), (-0.9, 0.3)])
-def test_nearest_places_lie_between_others(shift):
-    """Places of the source lie off the target's lattice by parts of a step, and are found there."""
-    scene, rng = Scene(21), np.random.default_rng(2)
-    at = lattice(80.0)
-    source = Places(at + shift, scene.seen(at + shift, 0.4, rng), STEP_M)
-    target = Places(at, scene.seen(at, 0.4, rng), STEP_M)
-    index, found, likeness = nearest_places(source, target)
-    assert len(index) > 0.5 * len(at)
-    assert len(np.unique(index)) == len(index)
-    # at the rim there are no places on one side
-    inner = (np.abs(source.at[index] - 39.0) < 36.0).all(axis=1)
-    off = np.hypot(*(found - source.at[index])[inner].T)
-    # a place taken for the nearest of the lattice would be off by the shift
-    assert np.median(off) < 0.25 * STEP_M
-    assert likeness.min() > 0.5
-    # exchanged, the same pairs
-    other = nearest_places(target, source)[0]
-    assert len(other) == len(index)
-
-
 def test_many_places_are_thinned():
     orientations, _, _ = views(13, 0.0, (0.0, 0.0), corner=0.0)
     places = orientations[0].places
@@ -151,7 +129,6 @@ def test_nothing_comes_of_nothing():
     orientations, target, _ = views(15, 0.0, (0.0, 0.0), corner=0.0)
     assert poses_by_likelihood([TurnedPlaces(0.0, empty)], target) == []
     assert poses_by_likelihood(orientations, empty) == []
-    assert len(nearest_places(empty, target)[0]) == len(nearest_places(target, empty)[0]) == 0
     alike = Places(target.at, np.broadcast_to(target.descriptors[:1], target.descriptors.shape), STEP_M)
     assert LEAST_LOG_RATIO > 0.0
     assert poses_by_likelihood([TurnedPlaces(0.0, alike)], alike) == []
