@@ -18,28 +18,25 @@ from mtpcr_geo.core.arrays import Floats, Grey
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Hypothesis, Matches
-from mtpcr_geo.match.base import Advance, Features, ImageMatcher, PixelMatches, View, margin_of, one_to_one
-from mtpcr_geo.match.guided import agreeing_share, places_about, reach_m, within_reach
-from mtpcr_geo.match.likelihood import Places, TurnedPlaces, poses_by_likelihood
+from mtpcr_geo.match.base import Advance, Features, ImageMatcher, PixelMatches, View, margin_of
 from mtpcr_geo.match.search import angle_between
-from mtpcr_geo.match.turning import NOT_TURNED, ZOOM, affine, magnified, places_on_ground, shrunk, turn_image
+from mtpcr_geo.match.turned import Frame, Turned, agreeing_by_chance, nearest_turn, posed, ties_of
+from mtpcr_geo.match.turning import ZOOM, affine, magnified, reduced, shrunk
 from mtpcr_geo.match.votes import (
-    EXAMINED,
-    KEPT,
     LEAST_STRENGTH,
     Candidates,
     VotedPose,
     agreeing_keypoints,
     candidates_of,
-    poses_by_votes,
     strengths_of,
-    votes_for,
 )
 from mtpcr_geo.method.solve import ransac_upright
 
 TRIES = 20_000
 """Pairs of matches tried for a yaw and a shift: finds a pose that 2 % of the matches support."""
 AGREE_CELLS = 1.5
+LEAST_AGREEING = 4
+"""Matches beyond two that agree on a yaw by which the source is turned once more."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +48,8 @@ class Orientation:
         found: one-to-one matches, in pixels of the unturned images.
         T: 4x4 planar pose on which most of them agree, metres.
         agreeing: (n,) those that agree.
-        rival: 4x4 pose on which most of the others agree.
-        rival_count: how many they are, less two.
+        runner_up: 4x4 pose on which most of the others agree.
+        runner_up_count: how many they are, less two.
 
     """
 
@@ -81,6 +78,8 @@ class KeypointMatcher:
         tolerance_m: plan distance within which matches agree, metres; 1.5 of the larger cells if None.
         sweep_keypoints: keypoints that orientations are compared by; the best is matched with all. None for
             all at once.
+        sweep_to: edge that images are shrunk to, by a whole factor, for comparing orientations, pixels; 0 for
+            never.
         candidates: partners of a keypoint that vote for a pose, see `mtpcr_geo.match.votes`; 0 for poses by
             consensus of the matches alone. Only for a `FeatureMatcher` with descriptors of unit length.
 
@@ -92,6 +91,7 @@ class KeypointMatcher:
     tolerance_m: float | None = None
     magnify_to: int = 0
     sweep_keypoints: int | None = None
+    sweep_to: int = 0
     candidates: int = 0
     needs_image: bool = field(default=True, init=False)
     needs_one_cell: bool = field(default=False, init=False)
@@ -121,19 +121,19 @@ class KeypointMatcher:
         turns = self._sweep(yaw)
         if self.candidates:
             return self._by_votes(source, target, image, prepared, turns, zoom, tolerance, advance)
-        few = self.sweep_keypoints if len(turns) > 1 else None
-        tried, turned = [], []
-        for turn in turns:
-            one = _Turned.of(image, source.empty, turn, self.images)
-            found = one.match(self.images, prepared, zoom, few)
-            tried.append(_judge(turn, found, source.grid, target.grid, tolerance, seed))
-            turned.append(one)
-            advance(1)
+        tried = self._tried(source, target, turns, zoom, tolerance, seed, advance, prepared)
         chosen = max(range(len(tried)), key=lambda k: (tried[k].count, float(tried[k].found.score.sum())))
         best = tried[chosen]
-        if few is not None:
-            found = turned[chosen].match(self.images, prepared, zoom)
-            best = _judge(best.turn, found, source.grid, target.grid, tolerance, seed)
+        if len(turns) > 1 and (self.sweep_keypoints is not None or self.sweep_to):
+            # at full size, turned by what the sweep found
+            yaw = transforms.yaw_of(best.T[:3, :3])
+            known = best.count >= LEAST_AGREEING and angle_between(yaw, best.turn) < np.pi / len(turns)
+            turn = yaw if known else best.turn
+            found = Turned.of(image, source.empty, turn, self.images).match(self.images, prepared, zoom)
+            whole = _judge(turn, found, source.grid, target.grid, tolerance, seed)
+            best = whole if whole.count >= best.count else best
+            # strengths are compared by what all orientations were matched by
+            tried[chosen] = replace(tried[chosen], T=best.T)
         if not len(best.found):
             seen = max(len(o.found.source_keypoints) for o in tried), len(best.found.target_keypoints)
             raise RegistrationError(self._nothing(seen, source.image.size))
@@ -164,6 +164,37 @@ class KeypointMatcher:
             target_keypoints=best.found.target_keypoints,
         )
 
+    def _tried(
+        self,
+        source: View,
+        target: View,
+        turns: list[float],
+        zoom: float,
+        tolerance: float,
+        seed: int,
+        advance: Advance,
+        prepared: Any,
+    ) -> list[Orientation]:
+        """Try all orientations; where there are several, by few keypoints and on small images if so set."""
+        assert source.image is not None
+        assert target.image is not None
+        several = len(turns) > 1
+        few = self.sweep_keypoints if several else None
+        longest = zoom * max(*source.image.shape, *target.image.shape)
+        by = -(-int(longest) // self.sweep_to) if several and self.sweep_to else 1
+        image = reduced(magnified(source.image, zoom), by, source.empty)
+        if by > 1:
+            small = reduced(magnified(target.image, zoom), by, target.empty)
+            prepared = self.images.prepare(small, target.empty)
+        tried = []
+        for turn in turns:
+            one = Turned.of(image, source.empty, turn, self.images)
+            found = one.match(self.images, prepared, zoom / by, few)
+            # pixels of shrunk images are as much larger
+            tried.append(_judge(turn, found, source.grid, target.grid, tolerance * max(by / zoom, 1.0), seed))
+            advance(1)
+        return tried
+
     def _by_votes(
         self,
         source: View,
@@ -177,24 +208,24 @@ class KeypointMatcher:
     ) -> Matches:
         """Find a pose by the candidates of all orientations.
 
-        The matches handed on are those of `_ties`. The margin is over the next distinct pose and over the
+        The matches handed on are those of `ties_of`. The margin is over the next distinct pose and over the
         best of the mirrored source, which looks alike and has no right pose.
         """
         target_px = shrunk(prepared[0].px, zoom)
-        frame = _Frame(source.grid, target.grid, zoom, tolerance)
+        frame = Frame(source.grid, target.grid, zoom, tolerance)
         orientations, turned = [], []
         for turn in turns:
-            one = _Turned.of(image, source.empty, turn, self.images)
+            one = Turned.of(image, source.empty, turn, self.images)
             orientations.append(self._candidates_of(one, prepared[0], zoom, turn, source.grid))
             turned.append(one)
             advance(1)
-        voted = _posed(turns, turned, orientations, prepared[0], frame)
+        voted = posed(turns, turned, orientations, prepared[0], frame)
         keypoints = max(len(one.source) for one in orientations), len(target_px)
         if not voted or not len(voted[0].found):
             raise RegistrationError(self._nothing(keypoints, image.size))
         flipped = np.ascontiguousarray(image[:, ::-1])
-        others = [_Turned.of(flipped, source.empty, turn, self.images) for turn in turns]
-        mirrored = _posed(
+        others = [Turned.of(flipped, source.empty, turn, self.images) for turn in turns]
+        mirrored = posed(
             turns,
             others,
             [
@@ -205,13 +236,13 @@ class KeypointMatcher:
             frame,
         )
         best = voted[0]
-        nearest = _nearest_turn(turns, best.T)
+        nearest = nearest_turn(turns, best.T)
         own = turned[nearest].match(self.images, prepared, zoom)
-        found = _ties(best, own, turned[nearest], prepared[0], frame)
+        found = ties_of(best, own, turned[nearest], prepared[0], frame)
         chance = None
         if mirrored:
-            opposite = others[_nearest_turn(turns, mirrored[0].T)]
-            chance = _chance(mirrored[0], opposite, prepared[0], frame)
+            opposite = others[nearest_turn(turns, mirrored[0].T)]
+            chance = agreeing_by_chance(mirrored[0], opposite, prepared[0], frame)
         strengths, null = strengths_of(voted), strengths_of(mirrored)
         hypotheses = tuple(_hypothesis(one, value) for one, value in zip(voted, strengths, strict=True))
         rivals = [one.as_rival for one in (*voted[1:], *mirrored)]
@@ -248,7 +279,7 @@ class KeypointMatcher:
         )
 
     def _candidates_of(
-        self, turned: _Turned, target: Features, zoom: float, turn: float, grid: Grid
+        self, turned: Turned, target: Features, zoom: float, turn: float, grid: Grid
     ) -> Candidates:
         features = cast(Features, turned.prepared[0])
         px = shrunk(affine(turned.back, features.px), zoom)
@@ -267,121 +298,6 @@ class KeypointMatcher:
         if yaw is not None:
             return [yaw]
         return [2 * np.pi * k / self.turns for k in range(self.turns)]
-
-
-@dataclass(frozen=True)
-class _Turned:
-    """The source's image in one orientation, prepared, and the affine map back to the image itself."""
-
-    prepared: Any
-    back: Floats
-
-    @classmethod
-    def of(cls, image: Grey, empty: int, turn: float, images: ImageMatcher) -> _Turned:
-        turned, back = turn_image(image, turn, empty)
-        return cls(images.prepare(turned, empty), back)
-
-    def match(self, images: ImageMatcher, target: Any, zoom: float, most: int | None = None) -> PixelMatches:
-        """Match to a prepared target, in pixels of the images before magnifying and turning."""
-        found = images.match(self.prepared, target, most)
-        return one_to_one(
-            PixelMatches(
-                shrunk(affine(self.back, found.source_px), zoom),
-                shrunk(found.target_px, zoom),
-                np.clip(found.score, 0.0, 1.0),
-                shrunk(affine(self.back, found.source_keypoints), zoom),
-                shrunk(found.target_keypoints, zoom),
-            )
-        )
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """What the pixels of two magnified images mean: the rasters' grids, the magnification, the tolerance."""
-
-    source: Grid
-    target: Grid
-    zoom: float
-    tolerance: float
-
-
-def _posed(
-    turns: list[float],
-    turned: list[_Turned],
-    orientations: list[Candidates],
-    target: Features,
-    frame: _Frame,
-) -> list[VotedPose]:
-    """Find poses by the descriptors of all places if the network gives these, else by keypoints' votes."""
-    target_px = shrunk(target.px, frame.zoom)
-    if target.places is None:
-        return poses_by_votes(orientations, target_px, frame.target, frame.tolerance)
-    places = [_places_of(one, target, frame) for one in turned]
-    seen = [TurnedPlaces(turn, one) for turn, (one, _) in zip(turns, places, strict=True)]
-    whole = places[0][1]
-    found = poses_by_likelihood(seen, whole, most=EXAMINED, yaw=turns[0] if len(turns) == 1 else None)
-    agreeing = votes_for([one.T for one in found], orientations, target_px, frame.target, frame.tolerance)
-    weighed = [replace(one, likelihood=pose.strength) for one, pose in zip(agreeing, found, strict=True)]
-    return sorted(weighed, key=lambda one: -one.strength)[:KEPT]
-
-
-def _nearest_turn(turns: list[float], T: Floats) -> int:
-    yaw = transforms.yaw_of(T[:3, :3])
-    return min(range(len(turns)), key=lambda k: angle_between(turns[k], yaw))
-
-
-def _ties(
-    best: VotedPose, own: PixelMatches, turned: _Turned, target: Features, frame: _Frame
-) -> PixelMatches:
-    """Return what is matched about a pose, agreeing or not; about no more than its keypoints without a map.
-
-    Where the network describes all places, each is sought near its place under the pose, and what the image
-    matcher found farther off is left out. Else nothing tells where to seek: the keypoints that agree are
-    returned, and all of the image matcher's.
-    """
-    if target.places is None:
-        return one_to_one(
-            PixelMatches(
-                np.concatenate([best.found.source_px, own.source_px]),
-                np.concatenate([best.found.target_px, own.target_px]),
-                # what agrees with the pose goes before what does not
-                np.concatenate([0.5 + 0.5 * best.found.score, 0.5 * own.score]),
-                own.source_keypoints,
-                own.target_keypoints,
-            )
-        )
-    source, whole = _places_of(turned, target, frame)
-    pairs = places_about(source, whole, best.T)
-    s, t = frame.source.to_metres(own.source_px), frame.target.to_metres(own.target_px)
-    own = own.take(within_reach(s, t, best.T, reach_m(whole)))
-    return one_to_one(
-        PixelMatches(
-            np.concatenate([own.source_px, frame.source.to_pixel(source.at[pairs.index])]),
-            np.concatenate([own.target_px, frame.target.to_pixel(pairs.at)]),
-            np.concatenate([own.score, pairs.sure]),
-            own.source_keypoints,
-            own.target_keypoints,
-        )
-    )
-
-
-def _places_of(turned: _Turned, target: Features, frame: _Frame) -> tuple[Places, Places]:
-    """Return the places of the source in one orientation, and those of the target."""
-    seen = cast(Features, turned.prepared[0]).places
-    assert seen is not None  # the target's features have them, and come of the same graph
-    assert target.places is not None
-    return (
-        places_on_ground(seen, turned.back, frame.zoom, frame.source),
-        places_on_ground(target.places, NOT_TURNED, frame.zoom, frame.target),
-    )
-
-
-def _chance(mirrored: VotedPose, turned: _Turned, target: Features, frame: _Frame) -> float | None:
-    """Return the share of places that agree with the mirrored source's best pose, which cannot be right."""
-    if target.places is None:
-        return None
-    source, whole = _places_of(turned, target, frame)
-    return agreeing_share(places_about(source, whole, mirrored.T), frame.tolerance)
 
 
 def _judge(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.types import Matches
@@ -25,7 +25,7 @@ class KeypointSettings:
 
     Attributes:
         models: folder of model files; the environment's if None.
-        turns: orientations tried where a matcher does not bear any angle.
+        turns: orientations tried where a matcher does not bear any angle; the model's own if None.
         tolerance_m: plan distance within which matches agree on an orientation; from the cells if None.
         max_keypoints: kept of an image; the matcher's own if None.
         tile: edge of the tiles of learned extractors, pixels; the model's own if None.
@@ -36,7 +36,7 @@ class KeypointSettings:
     """
 
     models: Path | None = None
-    turns: int = 8
+    turns: int | None = None
     tolerance_m: float | None = None
     max_keypoints: int | None = None
     tile: int | None = None
@@ -96,9 +96,8 @@ def make_matcher(name: str, correlation: CorrelationSettings, keypoints: Keypoin
     """
     if name == "correlation":
         return CorrelationMatcher(correlation)
-    shared: dict[str, Any] = {"turns": keypoints.turns, "tolerance_m": keypoints.tolerance_m}
     if name in ("rootsift", "orb"):
-        return KeypointMatcher(name, _classical(name, keypoints), **shared)
+        return KeypointMatcher(name, _classical(name, keypoints), tolerance_m=keypoints.tolerance_m)
     folder = models_folder(keypoints.models)
     known = descriptions(folder)
     if name not in known:
@@ -109,9 +108,11 @@ def make_matcher(name: str, correlation: CorrelationSettings, keypoints: Keypoin
     return KeypointMatcher(
         name,
         _learned(model, folder, keypoints),
-        **shared,
+        turns=model.turns if keypoints.turns is None else keypoints.turns,
+        tolerance_m=keypoints.tolerance_m,
         magnify_to=model.extractor.magnify_to if model.extractor else 0,
         sweep_keypoints=model.matcher.sweep_keypoints if model.matcher else None,
+        sweep_to=model.extractor.sweep_to if model.extractor else 0,
         candidates=model.extractor.candidates if model.extractor else 0,
     )
 

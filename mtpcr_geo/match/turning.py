@@ -45,6 +45,25 @@ def magnified(image: Grey, zoom: float) -> Grey:
     return np.asarray(bigger, np.uint8)
 
 
+def reduced(image: Grey, by: int, fill: int) -> Grey:
+    """Shrink a (h, w) uint8 image by a whole factor, each pixel the mean of its part: `shrunk` by 1 / factor.
+
+    Args:
+        image: the image.
+        by: the factor.
+        fill: grey value by which it is extended to whole pixels.
+
+    """
+    if by == 1:
+        return image
+    height, width = image.shape
+    rows, columns = -(-height // by), -(-width // by)
+    whole = cv2.copyMakeBorder(
+        image, 0, rows * by - height, 0, columns * by - width, cv2.BORDER_CONSTANT, value=(float(fill),)
+    )
+    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def turn_image(image: Grey, turn: float, fill: int) -> tuple[Grey, Floats]:
     """Turn an image counter-clockwise (north up) onto a canvas that holds all of it.
 

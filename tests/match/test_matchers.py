@@ -24,7 +24,7 @@ from mtpcr_geo.match.learned.lightglue import LightGlue, normalised
 from mtpcr_geo.match.learned.model_cards import ExtractorFile, MatcherFile, descriptions
 from mtpcr_geo.match.learned.onnx import OnnxExtractor, Running, filled, tiles
 from mtpcr_geo.match.registry import KeypointSettings, make_matcher
-from mtpcr_geo.match.turning import magnified, turn_image
+from mtpcr_geo.match.turning import magnified, reduced, shrunk, turn_image
 from mtpcr_geo.method.focus import FocusSettings, Subject, focus, neighbourhood, overlap_share
 from mtpcr_geo.method.images import image_of
 from mtpcr_geo.registration import build_pipeline, read_options, register
@@ -148,6 +148,17 @@ def test_magnified_pixels():
     assert [(column + 0.5) / 1.5 - 0.5, (row + 0.5) / 1.5 - 0.5] == pytest.approx([21.0, 9.0], abs=0.1)
 
 
+@pytest.mark.parametrize("by", [1, 2, 3])
+def test_reduced_pixels(by):
+    image = np.full((20, 31), 7, np.uint8)
+    image[8:11, 20:23] = 207
+    smaller = reduced(image, by, 7)
+    assert smaller.shape == (-(-20 // by), -(-31 // by))
+    row, column = (float(np.average(axis, weights=smaller - 7.0)) for axis in np.indices(smaller.shape))
+    # a pixel that is filled in part has its place in its middle
+    assert shrunk(np.array([[column, row]]), 1 / by)[0] == pytest.approx([21.0, 9.0], abs=0.2)
+
+
 @pytest.mark.parametrize("shape", [(40, 100), (1000, 513), (512, 512), (1300, 2049)])
 def test_tiles_cover_every_pixel_once(shape):
     seen = np.zeros(shape, int)
@@ -238,7 +249,7 @@ def test_superpoint_and_lightglue_of_random_weights_run_the_whole_path(town_file
     assert match["method"] == "superpoint"
     assert len(match["turns_deg"]) == 8
     # random projections of patches tell places apart: the yaw is found, and not by ICP alone
-    assert match["turn_deg"] == 90.0
+    assert match["turn_deg"] == pytest.approx(90.0, abs=0.5)
     assert max(match["turn_agreeing"]) > 10
     assert result.T_target_source is not None
     assert np.degrees(transforms.yaw_of(result.T_target_source[:3, :3])) == pytest.approx(90.0, abs=0.5)
@@ -251,6 +262,25 @@ def test_superpoint_and_lightglue_of_random_weights_run_the_whole_path(town_file
     } <= {chunk.entity_path for chunk in chunks}  # fmt: skip
     # arrays stay out of what is written as JSON
     assert len(json.dumps(match)) < 2000
+
+
+def test_orientations_are_compared_on_small_images_and_the_best_is_matched_whole(small_models, tmp_path):
+    for path in small_models.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    card = tmp_path / "superpoint.toml"
+    text = card.read_text(encoding="utf-8")
+    text = text.replace("[extractor]", "turns = 4\n[extractor]\nsweep_to = 180", 1)
+    card.write_text(text, encoding="utf-8")
+    views = quarter_turned(0.25)
+    whole, swept = (matcher("superpoint", folder).match(*views) for folder in (small_models, tmp_path))
+    assert len(swept.report["turns_deg"]) == 4
+    assert len(whole.report["turns_deg"]) == 8
+    for found in (whole, swept):
+        assert found.report["turn_deg"] == pytest.approx(90.0, abs=0.5)
+        assert found.hypotheses[0].yaw == pytest.approx(np.pi / 2, abs=0.01)
+        # of all keypoints, at the pixels of the whole images
+        assert found.report["agreeing"] >= max(found.report["turn_agreeing"])
+    assert np.hypot(*np.subtract(*(one.hypotheses[0].shift for one in (whole, swept)))) < 0.3
 
 
 def test_paper_profile_runs_the_whole_path(town_files, small_models, tmp_path):

@@ -53,6 +53,12 @@ class ExtractorFile(_Part):
     magnify_to: int = Field(
         0, ge=0, description="images are magnified twice where they then stay within this edge; 0 for never"
     )
+    sweep_to: int = Field(
+        0,
+        ge=0,
+        description="orientations are compared on images shrunk by a whole factor to this edge, and the best "
+        "is matched at full size; 0 for never",
+    )
     candidates: int = Field(
         0,
         ge=0,
@@ -136,6 +142,13 @@ class ModelDescription(_Part):
     title: str
     kind: Literal["keypoints", "fused"]
     any_yaw: bool = Field(False, description="finds its way at any angle, so that no sweep is needed")
+    turns: int = Field(
+        8,
+        ge=1,
+        le=72,
+        description="orientations in which the source is tried, round the circle: as many as it takes for "
+        "what it bears of rotation",
+    )
     look: Look | None = Field(
         None,
         description="image that the weights were trained on, and that profiles show it; if not given, the "

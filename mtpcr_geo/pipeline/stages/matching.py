@@ -101,8 +101,12 @@ class MatchOptions(PriorOptions, StageOptions):
         "level, rasterise and match again under others, and keep the strongest",
     )
     models: Models = None
-    turns: int = Field(
-        8, ge=1, le=72, description="orientations in which learned matchers are tried, round the circle"
+    turns: int | None = Field(
+        None,
+        ge=1,
+        le=72,
+        description="orientations in which learned matchers are tried, round the circle; the model's own if "
+        "not given",
     )
     tolerance: float | None = Field(
         None,
