@@ -259,12 +259,15 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.match survey.tiles[].path``: a tile that was read
 - ``mtpcr.match survey.tiles[].bytes``: its size
 - ``mtpcr.match survey.tiles[].modified_ns``: time of its last change, nanoseconds since 1970
-- ``mtpcr.match zoom``: factor by which images were reduced before keypoints were sought
+- ``mtpcr.match zoom``: factor by which images were magnified before keypoints were sought
 - ``mtpcr.match turns_deg``: turns of the source that were tried
 - ``mtpcr.match turn_matches``: matches at each of them; where keypoints vote, their candidates
 - ``mtpcr.match turn_agreeing``: of these, matches that agree on one pose; where keypoints vote, keypoints of
   which a candidate agrees on the pose of most votes
-- ``mtpcr.match turn_deg``: the turn that was taken
+- ``mtpcr.match turn_deg``: the turn that was taken: the yaw found, where orientations were compared by less
+  than all keypoints, or on shrunk images
+- ``mtpcr.match agreeing_by_chance``: share of the places that agree with the best pose of the mirrored
+  source, which cannot be right; null where the network describes no places
 - ``mtpcr.match agreeing``: matches that agree at that turn; where keypoints vote, pairs that agree on the
   pose
 - ``mtpcr.match tolerance_m``: how far agreeing matches may lie from the pose

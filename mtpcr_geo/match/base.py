@@ -179,6 +179,8 @@ def one_to_one(found: PixelMatches, apart_px: float = 1.0) -> PixelMatches:
     return found.take(np.array(kept, np.int64))
 
 
+TOLERATED_DEG = 26.0
+"""Rotation that descriptors tolerate: an orientation of the source tells of yaws no farther from it."""
 LARGEST_MARGIN = 1000.0
 
 

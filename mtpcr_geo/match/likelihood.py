@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.match.base import TOLERATED_DEG
 from mtpcr_geo.match.pose import Pose
 from mtpcr_geo.match.search import distinct
 from mtpcr_geo.method.solve import fit_upright
@@ -47,8 +48,6 @@ target's places than memory has room for; but of a very large target as many as 
 BLOCK_PAIRS = 4_000_000
 """Pairs whose descriptors are compared at once."""
 ROUNDS = 4
-TOLERATED_DEG = 26.0
-"""Rotation that descriptors tolerate."""
 SMOOTHING = 1.0 / (4 * np.pi)
 """Sum of the squares of the weights of a Gaussian that is one bin wide."""
 

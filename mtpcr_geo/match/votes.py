@@ -19,13 +19,11 @@ from numpy.typing import NDArray
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.grid import Grid
-from mtpcr_geo.match.base import Features, PixelMatches, one_to_one
+from mtpcr_geo.match.base import TOLERATED_DEG, Features, PixelMatches, one_to_one
 from mtpcr_geo.match.pose import Pose
 from mtpcr_geo.match.search import angle_between, distinct
 from mtpcr_geo.method.solve import fit_upright
 
-TOLERATED_DEG = 26.0
-"""Rotation that descriptors tolerate: keypoints of an orientation vote for yaws no farther from it."""
 YAW_STEPS_DEG = (0.5, 3.0)
 """Finest and coarsest step between yaws; between them it moves keypoints by the tolerance."""
 MOST_BINS = 1000
