@@ -14,6 +14,7 @@ from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.groups import Groups
 from mtpcr_geo.core.types import Bev
 from mtpcr_geo.method.bev import BLOCK, grid_around, rasterise
+from mtpcr_geo.method.ground import connected_ground
 
 OVERLAP_CELL_M = 2.0
 LOW_RADIUS_M = 6.0
@@ -137,8 +138,10 @@ class Overlap:
         Cells count whose lowest points lie low among their neighbours in both clouds: not on roofs, not
         in crowns.
         """
+        cell = self.grid.cell
         both = (self.source.count > 0) & (self.target.count > 0)
-        both &= _lies_low(self.source.low, self.grid.cell) & _lies_low(self.target.low, self.grid.cell)
+        for bev in (self.source, self.target):
+            both &= connected_ground(bev.low, _lies_low(bev.low, cell), cell)
         row, column = np.nonzero(both)
         xy = self.grid.to_metres(np.column_stack([column, row]).astype(np.float64))
         heights = [
