@@ -88,10 +88,10 @@ class Pool:
     def of(cls, candidates: Sequence[Candidate], scales: Scales, bound: float = 0.0) -> Pool:
         """Rank candidates by strength and the ground, and join those that came down to the same place."""
         least = least_spread(candidates)
-        weighed = [(c.strength * _ground_factor(c.ground, least), c) for c in candidates]
-        weighed.sort(key=lambda one: (-one[0], -one[1].pose.score))
+        ranked = [(weighed(c, least), c) for c in candidates]
+        ranked.sort(key=lambda one: (-one[0], -one[1].pose.score))
         kept: list[tuple[float, Candidate]] = []
-        for strength, candidate in weighed:
+        for strength, candidate in ranked:
             if not any(
                 same_pose(candidate.pose, other.pose, scales.same_pose_m, scales.extent_m / 2)
                 for _, other in kept
@@ -117,9 +117,20 @@ class Pool:
         if least is None:
             best, rivals = self.candidates[0].strength, [c.strength for c in other.candidates]
         else:
-            best = self.candidates[0].strength * _ground_factor(self.candidates[0].ground, least)
-            rivals = [c.strength * _ground_factor(c.ground, least) for c in other.candidates]
+            best = weighed(self.candidates[0], least)
+            rivals = [weighed(c, least) for c in other.candidates]
         return margin_of([best, max(rivals, default=0.0)], floor=other.bound)
+
+
+def weighed(candidate: Candidate, least_m: float) -> float:
+    """Return a hypothesis' strength, times how well the ground agrees.
+
+    Args:
+        candidate: the hypothesis.
+        least_m: least spread of the ground's height differences of all hypotheses, metres.
+
+    """
+    return candidate.strength * _ground_factor(candidate.ground, least_m)
 
 
 def least_spread(candidates: Sequence[Candidate]) -> float:

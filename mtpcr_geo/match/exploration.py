@@ -17,7 +17,7 @@ from mtpcr_geo.match.pyramid import Level, Pyramid
 from mtpcr_geo.match.repetition import REPEATS, self_likeness
 from mtpcr_geo.match.search import GlobalSearch, Layer, all_yaws, distinct
 from mtpcr_geo.match.terrain import FEWEST_CELLS as FEWEST_GROUND_CELLS
-from mtpcr_geo.match.terrain import Terrain, TerrainSearch, closest, place_on
+from mtpcr_geo.match.terrain import Terrain, TerrainSearch, cell_to_compare, closest, place_on
 from mtpcr_geo.method.ground import bare
 from mtpcr_geo.method.scales import Scales
 
@@ -118,9 +118,12 @@ class Exploration:
         self.pyramid: Pyramid = Pyramid(source, target, None if beside is None else beside.pyramid)
         self.scales, self.settings, self.advance, self.prior = scales, settings, advance, prior
         self.bare: tuple[Bev, Bev] = (bare(source), bare(target) if beside is None else beside.bare[1])
-        self.terrain = (
-            Terrain.of(self.bare[0], scales.terrain_cell_m),
-            Terrain.of(self.bare[1], scales.terrain_cell_m),
+        self.ground_cell_m: float = (
+            cell_to_compare(*self.bare, scales.terrain_cell_m) if beside is None else beside.ground_cell_m
+        )
+        self.terrain: tuple[Terrain, Terrain] = (
+            Terrain.of(self.bare[0], self.ground_cell_m),
+            Terrain.of(self.bare[1], self.ground_cell_m) if beside is None else beside.terrain[1],
         )
         self.judge = Judge(
             self.pyramid,
@@ -140,6 +143,8 @@ class Exploration:
         self.done: list[Step] = []
         self.judged: list[Candidate] = []
         self.pool = Pool()
+        self._left: list[Pose] = []
+        self._known, self._bound = 0.0, 0.0
         self._proposed: dict[int, list[Pose]] = {}
         self._followed: list[Pose] = []
         self._likeness: tuple[Pose, float] | None = None
@@ -157,7 +162,7 @@ class Exploration:
         """
         first = not self.done
         self.done.append(step)
-        known = max([known, *self.pool.strengths[:1]])
+        given_known, known = known, max([known, *self.pool.strengths[:1]])
         if step.by_terrain:
             poses, bound = self._by_terrain(step)
         else:
@@ -166,10 +171,8 @@ class Exploration:
             poses += [] if given is None else self._nearby(step.factor, [given])
         if not poses:
             return False
-        known = max([known, *(candidate.strength for candidate in self.judged)])
-        now, left = self.judge.judge(poses, known)
-        self.judged += now
-        self._rank(max(self.pool.bound, bound, left))
+        self._known, self._bound = max(self._known, given_known), max(self._bound, bound)
+        self._judge(poses, known)
         if self.pool.candidates and (step.by_terrain or self.repeats()):
             self._comb_about_the_best(known)
         return True
@@ -211,8 +214,26 @@ class Exploration:
         descent = follow(self.pyramid, factor, self._on_level(factor, poses))
         return [*comb_each(self.pyramid, poses, self.scales.terrain_cell_m), *descent.poses]
 
-    def _rank(self, bound: float) -> None:
+    def _judge(self, poses: list[Pose], known: float) -> None:
+        """Judge poses and rank; of what was left, judge what the best turned out not to be clear of.
+
+        How much the ground takes off a strength is known only when another hypothesis shows how well the
+        grounds can agree.
+        """
+        while True:
+            now, left = self.judge.judge(poses, known, self.judged)
+            self.judged += now
+            self._left += left
+            self._rank()
+            known = max([self._known, *self.pool.strengths[:1]])
+            poses = [pose for pose in self._left if pose.score * CLEAR_MARGIN >= known]
+            if not poses:
+                return
+            self._left = [pose for pose in self._left if pose.score * CLEAR_MARGIN < known]
+
+    def _rank(self) -> None:
         """Rank what was judged; the best is judged at the finest cells, if a first look had been enough."""
+        bound = max([self._bound, *(pose.score for pose in self._left)])
         self.pool = Pool.of(self.judged, self.scales, bound)
         while self.pool.candidates and not self.pool.candidates[0].complete:
             best = self.pool.candidates[0]
@@ -227,12 +248,11 @@ class Exploration:
         if near.score > best.score and not same_pose(
             near, best, self.scales.cell_m, self.scales.extent_m / 2
         ):
-            self.judged += self.judge.judge([near], known)[0]
-            self._rank(self.pool.bound)
+            self._judge([near], known)
 
     def catch_up(self, other: Exploration) -> None:
         """Search what another has searched, as far as it matters beside what that found."""
-        known = other.pool.candidates[0].strength if other.pool.candidates else 0.0
+        known = max(other.pool.strengths[:1], default=0.0)
         for step in other.done[len(self.done) :]:
             self.explore(step, known)
 

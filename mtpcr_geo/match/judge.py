@@ -9,7 +9,14 @@ import numpy as np
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Mask
-from mtpcr_geo.match.candidates import AGREE_TOLERANCES, RADIUS_TOLERANCES, Candidate, same_pose
+from mtpcr_geo.match.candidates import (
+    AGREE_TOLERANCES,
+    RADIUS_TOLERANCES,
+    Candidate,
+    least_spread,
+    same_pose,
+    weighed,
+)
 from mtpcr_geo.match.patches import PatchMatches, match_patches
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.pyramid import Pyramid
@@ -59,18 +66,20 @@ class Judge:
         """How far a patch may lie from where the pose puts it at the second look, cells."""
         return max(1, round(RADIUS_TOLERANCES * self.scales.tolerance_m / self.scales.cell_m))
 
-    def judge(self, poses: Sequence[Pose], known: float) -> tuple[list[Candidate], float]:
+    def judge(
+        self, poses: Sequence[Pose], known: float, before: Sequence[Candidate] = ()
+    ) -> tuple[list[Candidate], list[Pose]]:
         """Judge poses, those of the highest score first.
 
-        A strength is at most the score. What cannot come within `CLEAR_MARGIN` of the best is left with the
-        score as its bound, unjudged.
+        A strength is at most the score. What cannot come within `CLEAR_MARGIN` of the best is left, unjudged.
 
         Args:
             poses: at the finest cells.
-            known: strength reached by any hypothesis so far.
+            known: strength reached by any hypothesis so far, the ground included.
+            before: what was judged before, which tells how well the grounds can agree.
 
         Returns:
-            What was judged, and the highest score of what was not.
+            What was judged, and what was not.
 
         """
         separate: list[Pose] = []
@@ -79,12 +88,12 @@ class Judge:
             if np.isfinite(pose.score) and not any(same_pose(pose, o, near, np.inf) for o in separate):
                 separate.append(pose)
         judged: list[Candidate] = []
-        for pose in separate:
+        for number, pose in enumerate(separate):
             if pose.score * CLEAR_MARGIN < known:
-                return judged, pose.score
+                return judged, separate[number:]
             judged.append(self.judge_one(pose, known))
-            known = max(known, judged[-1].strength)
-        return judged, 0.0
+            known = max(known, weighed(judged[-1], least_spread([*before, *judged])))
+        return judged, []
 
     def judge_one(self, pose: Pose, known: float = 0.0) -> Candidate:
         """Match patches around a pose, let them correct it, and match again from there.

@@ -25,6 +25,12 @@ from mtpcr_geo.method.bev import coarsen
 NOISE_M = 0.1
 """Spread of the ground's height differences below which cells, borders and noise leave nothing to compare."""
 FEWEST_CELLS = 8
+FINER_PARTS = (8, 4, 2)
+LEAST_SEEN = 0.1
+"""Parts of the terrain's cell in which grounds may be compared, finest first, and the share of the ground's
+area that must show in them."""
+MOST_CELLS = 10_000
+"""Cells of the source that are compared at most: every so many-th of more."""
 SETTLING_STEPS, STILL_CELLS = 15, 0.002
 KNOWN = 0.99
 """Weight of filled cells above which an interpolated height is one of the ground alone."""
@@ -60,7 +66,7 @@ class GroundComparison:
     """How the shapes of both grounds compare under a pose.
 
     Attributes:
-        cells: cells compared.
+        cells: cells compared, of `MOST_CELLS` of the source at most.
         spread_m: robust standard deviation of their height differences, after one shift or one plane.
 
     """
@@ -72,6 +78,29 @@ class GroundComparison:
     def known(self) -> bool:
         """Whether there was enough ground to compare."""
         return self.cells >= FEWEST_CELLS
+
+
+def cell_to_compare(source: Bev, target: Bev, coarsest_m: float) -> float:
+    """Return the finest cell in which both clouds still see ground together, metres.
+
+    The finer the cells, the less of a slope, and of what hides the ground, lies within one. In cells too fine
+    for a thin cloud no ground lies beside other ground.
+
+    Args:
+        source, target: height rasters of the bare ground.
+        coarsest_m: cell that is taken if no finer one will do.
+
+    """
+    wide = [float(Terrain.of(bev, coarsest_m).mask.sum()) * coarsest_m**2 for bev in (source, target)]
+    for parts in FINER_PARTS:
+        cell = coarsest_m / parts
+        if cell < source.grid.cell:
+            continue
+        masks = [Terrain.of(bev, cell).mask for bev in (source, target)]
+        areas = [float(cv2.erode(mask, np.ones((2, 2), np.uint8)).sum()) * cell**2 for mask in masks]
+        if all(area >= LEAST_SEEN * most for area, most in zip(areas, wide, strict=True)):
+            return cell
+    return coarsest_m
 
 
 def compare_ground(
@@ -87,6 +116,8 @@ def compare_ground(
 
     """
     row, column = np.nonzero(source.mask)
+    every = -(-len(row) // MOST_CELLS)
+    row, column = row[::every], column[::every]
     xy = source.grid.to_metres(np.column_stack([column, row]).astype(np.float64))
     c, s = np.cos(hypothesis.yaw), np.sin(hypothesis.yaw)
     placed = xy @ np.array([[c, s], [-s, c]]) + hypothesis.shift

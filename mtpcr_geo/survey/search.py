@@ -338,8 +338,8 @@ class _Search:
                         # as in `Judge.judge`: its strength is at most its score
                         left = max(left, pose.score)
                         continue
-                    some, bound = self._judge_with(one, pyramid).judge([pose], known)
-                    left = max(left, bound)
+                    some, unjudged = self._judge_with(one, pyramid).judge([pose], known)
+                    left = max([left, *(one.score for one in unjudged)])
                     judged += some
                     known = max([known, *(candidate.strength for candidate in some)])
             self._rank(number, left)

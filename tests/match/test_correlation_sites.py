@@ -189,7 +189,7 @@ def test_the_best_is_judged_at_the_finest_cells_though_a_first_look_was_enough_f
     faint = search.judge.judge_one(best.pose, known=1e9)
     assert not faint.complete
     search.judged = [faint]
-    search._rank(0.0)
+    search._rank()
     again = search.pool.candidates[0]
     assert again.complete
     assert again.patches is not None

@@ -15,6 +15,7 @@ from mtpcr_geo.match.terrain import (
     FEWEST_CELLS,
     Terrain,
     TerrainSearch,
+    cell_to_compare,
     closest,
     compare_ground,
     place_on,
@@ -251,3 +252,38 @@ def test_the_closest_grounds_come_first_though_others_share_more(target) -> None
     # the first given is kept first whatever it comes to
     assert np.hypot(first.east - true.east, first.north - true.north) > 20.0
     assert np.hypot(second.east - true.east, second.north - true.north) < 2.0
+
+
+def thinned(bev: Bev, share: float, seed: int) -> Bev:
+    """Leave a share of the cells."""
+    kept = (np.random.default_rng(seed).random(bev.top.shape) < share) & (bev.count > 0)
+    top, low = (np.where(kept, band, np.float32(np.nan)) for band in (bev.top, bev.low))
+    return Bev(bev.grid, top, low, np.where(kept, bev.count, np.uint32(0)))
+
+
+@pytest.mark.parametrize(("share", "parts"), [(1.0, 8), (0.7, 8), (0.3, 4), (0.12, 2), (0.02, 1)])
+def test_grounds_are_compared_in_the_finest_cells_that_show_them(share: float, parts: int) -> None:
+    seen = bev_of(ground(3, (0.0, 0.0), (160.0, 120.0)))
+    thin = thinned(seen, share, 5)
+    assert cell_to_compare(seen, thin, 8.0) == cell_to_compare(thin, seen, 8.0)
+    # no cell is finer than the raster's
+    assert cell_to_compare(seen, seen, 2.0) == 1.0
+    assert 8.0 / cell_to_compare(seen, thin, 8.0) == parts
+
+
+def test_on_a_slope_grounds_that_are_seen_in_part_agree_in_fine_cells_only() -> None:
+    """What hides half of a cell moves the lowest point in it."""
+    steep, again = (ground(seed, (0.0, 0.0), (160.0, 120.0), 4.0) for seed in (3, 4))
+    for one in (steep, again):
+        one[:, 2] += 0.4 * one[:, 0]
+    rng = np.random.default_rng(8)
+    hidden = np.zeros(len(steep), bool)
+    for middle in rng.uniform((0.0, 0.0), (160.0, 120.0), (2000, 2)):
+        hidden |= (np.abs(steep[:, 0] - middle[0]) < 2.0) & (np.abs(steep[:, 1] - middle[1]) < 2.0)
+    part, whole = bev_of(steep[~hidden]), bev_of(again)
+    here = Hypothesis(0.0, (0.0, 0.0), 0.0, 0)
+    coarse, fine = (
+        compare_ground(Terrain.of(part, cell), Terrain.of(whole, cell), here) for cell in (8.0, 1.0)
+    )
+    assert fine.known
+    assert fine.spread_m < 0.5 * coarse.spread_m
