@@ -232,6 +232,7 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
   it was not searched; from keypoints that vote, pairs that agree on each, less two
 - ``mtpcr.match self_likeness``: correlation of the scene under the best hypothesis with itself, moved: a
   scene that repeats itself has 0.4 and more
+- ``mtpcr.match by_proposals``: whether the best hypothesis was proposed by the network
 - ``mtpcr.match null_ratio``: score times support of the best hypothesis over the best of these
 - ``mtpcr.match verticals[].source``: what the source was levelled by, where several verticals were tried
 - ``mtpcr.match verticals[].target``: the same of the target

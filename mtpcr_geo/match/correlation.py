@@ -87,7 +87,8 @@ def _match(
         twin = Exploration(
             mirrored, target, scales, settings, seed, advance, null, search, MIRRORED_HYPOTHESES
         )
-    for step in steps_of(search_factors(source, target)):
+    proposals = settings.proposals is not None and prior is None
+    for step in steps_of(search_factors(source, target), proposals):
         if not search.explore(step):
             continue
         settled = search.settles()
@@ -135,6 +136,7 @@ def _match(
         "mirrored_strengths": None if twin is None else [round(c.strength, 3) for c in twin.pool.candidates],
         "null_ratio": null_ratio,
         "self_likeness": search.likeness,
+        "by_proposals": search.proposed,
     }
     return Matches(
         source_px=patches.source_px,

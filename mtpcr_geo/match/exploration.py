@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Literal, Protocol
 
 import numpy as np
 
-from mtpcr_geo.core.types import Bev
+from mtpcr_geo.core.types import Bev, Hypothesis
 from mtpcr_geo.match.candidates import Candidate, Pool, same_pose
 from mtpcr_geo.match.descent import comb, comb_each, follow
 from mtpcr_geo.match.judge import CLEAR_MARGIN, Judge
@@ -61,6 +62,7 @@ class CorrelationSettings:
             alike have given 11 to a pose 120 m off, where the true one had 48.
         mirrored_null: search the mirrored source too.
         trust_vertical: whether both verticals are known, so that the terrains may differ by a shift alone.
+        proposals: who proposes further poses where the search does not settle; None for nobody.
 
     """
 
@@ -73,6 +75,14 @@ class CorrelationSettings:
     convincing_neg_log10_p: float = 20.0
     mirrored_null: bool = True
     trust_vertical: bool = True
+    proposals: Proposals | None = None
+
+
+class Proposals(Protocol):
+    """Proposes poses by other means than the search's own."""
+
+    def poses(self, source: Bev, target: Bev) -> list[Hypothesis]:
+        """Propose poses of the source over the target, both levelled rasters of one cell, best first."""
 
 
 @dataclass(frozen=True)
@@ -82,22 +92,36 @@ class Step:
     Attributes:
         factor: the level's cell as a multiple of the finest.
         part: 0 for the level's best hypotheses, 1 for its others.
-        by_terrain: propose by the terrain, instead of by height and step edges.
+        by: what proposes: height and step edges (the channels of the search), the terrain, or
+            `CorrelationSettings.proposals`.
 
     """
 
     factor: int
     part: int
-    by_terrain: bool = False
+    by: Literal["channels", "terrain", "proposals"] = "channels"
+
+    @property
+    def by_terrain(self) -> bool:
+        """Return whether the terrain proposes."""
+        return self.by == "terrain"
 
 
-def steps_of(factors: list[int]) -> Iterator[Step]:
-    """Give the steps of a search in order; the terrain is asked on the first level."""
+def steps_of(factors: list[int], proposals: bool = False) -> Iterator[Step]:
+    """Give the steps of a search in order: the terrain is asked on the first level, others' proposals last.
+
+    Args:
+        factors: cells of the levels, as multiples of the finest, coarsest first.
+        proposals: whether somebody else proposes.
+
+    """
     for number, factor in enumerate(factors):
         for part in (0, 1):
             yield Step(factor, part)
             if number == 0:
-                yield Step(factor, part, by_terrain=True)
+                yield Step(factor, part, "terrain")
+    if proposals:
+        yield Step(factors[len(factors) // 2], 0, "proposals")
 
 
 class Exploration:
@@ -143,6 +167,7 @@ class Exploration:
         self.done: list[Step] = []
         self.judged: list[Candidate] = []
         self.pool = Pool()
+        self.proposed = False
         self._left: list[Pose] = []
         self._known, self._bound = 0.0, 0.0
         self._proposed: dict[int, list[Pose]] = {}
@@ -163,7 +188,10 @@ class Exploration:
         first = not self.done
         self.done.append(step)
         given_known, known = known, max([known, *self.pool.strengths[:1]])
-        if step.by_terrain:
+        best = self.pool.candidates[:1]
+        if step.by == "proposals":
+            poses, bound = self._by_proposals(step), 0.0
+        elif step.by_terrain:
             poses, bound = self._by_terrain(step)
         else:
             poses, bound = self._by_channels(step, known)
@@ -173,8 +201,9 @@ class Exploration:
             return False
         self._known, self._bound = max(self._known, given_known), max(self._bound, bound)
         self._judge(poses, known)
-        if self.pool.candidates and (step.by_terrain or self.repeats()):
+        if self.pool.candidates and (step.by != "channels" or self.repeats()):
             self._comb_about_the_best(known)
+        self.proposed |= step.by == "proposals" and self.pool.candidates[:1] != best
         return True
 
     def _by_channels(self, step: Step, known: float) -> tuple[list[Pose], float]:
@@ -196,15 +225,26 @@ class Exploration:
     def _by_terrain(self, step: Step) -> tuple[list[Pose], float]:
         """Return what the terrains propose, at the finest cells, without what the channels had proposed."""
         share, count = (2, MORE_TERRAIN_HYPOTHESES) if step.part else (1, TERRAIN_HYPOTHESES)
+        proposed = self._propose_by_terrain(
+            self.scales.terrain_cell_m / share, count, COARSEST_YAW_STEP_DEG / share
+        )
+        return self._nearby(step.factor, self._others(proposed)), 0.0
+
+    def _by_proposals(self, step: Step) -> list[Pose]:
+        """Return what others propose, at the finest cells, without what the channels had proposed."""
+        assert self.settings.proposals is not None
+        centre = centre_of(self.pyramid.source.grid)
+        found = self.settings.proposals.poses(self.pyramid.source, self.pyramid.target)
+        return self._nearby(step.factor, self._others([pose_of(one, centre) for one in found]))
+
+    def _others(self, poses: list[Pose]) -> list[Pose]:
+        """Keep the poses that are none of those that the channels had proposed."""
         near, radius = self.scales.same_pose_m / 2, self.scales.extent_m / 2
-        others = [
+        return [
             pose
-            for pose in self._propose_by_terrain(
-                self.scales.terrain_cell_m / share, count, COARSEST_YAW_STEP_DEG / share
-            )
+            for pose in poses
             if not any(same_pose(pose, other, near, radius) for other in self._followed)
         ]
-        return self._nearby(step.factor, others), 0.0
 
     def _nearby(self, factor: int, poses: list[Pose]) -> list[Pose]:
         """Return the best places near poses that are some metres off, followed down and combed for.
@@ -254,7 +294,11 @@ class Exploration:
         """Search what another has searched, as far as it matters beside what that found."""
         known = max(other.pool.strengths[:1], default=0.0)
         for step in other.done[len(self.done) :]:
-            self.explore(step, known)
+            if step.by == "proposals" and not other.proposed:
+                # they made no difference there, and are dear
+                self.done.append(step)
+            else:
+                self.explore(step, known)
 
     def repeats(self) -> bool:
         """Return whether the scene under the best hypothesis fits itself after a shift."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import Matches
 from mtpcr_geo.match.base import Advance, ImageMatcher, Matcher, View
 from mtpcr_geo.match.correlation import CorrelationSettings
@@ -14,6 +15,9 @@ from mtpcr_geo.match.descriptors import Extractor, FeatureMatcher, NearestNeighb
 from mtpcr_geo.match.keypoints import KeypointMatcher
 from mtpcr_geo.match.learned.model_cards import ModelDescription, descriptions, models_folder, path_of
 from mtpcr_geo.match.prior import Prior
+
+if TYPE_CHECKING:
+    from mtpcr_geo.match.learned.proposals import LearnedProposals
 
 BUILT_IN = ("correlation", "rootsift", "orb")
 RATIO = 0.9
@@ -115,6 +119,27 @@ def make_matcher(name: str, correlation: CorrelationSettings, keypoints: Keypoin
         sweep_to=model.extractor.sweep_to if model.extractor else 0,
         candidates=model.extractor.candidates if model.extractor else 0,
     )
+
+
+def learned_proposals(threads: int = 0, name: str = "bev") -> LearnedProposals:
+    """Make what proposes poses to the correlation search; its file is opened once it is asked.
+
+    Args:
+        threads: orientations described at once; as many as there are cores if 0.
+        name: of a model in the package that describes all places of an image (`map_stride`).
+
+    """
+    from mtpcr_geo.match.learned.proposals import LearnedProposals
+
+    def opened() -> Extractor:
+        from mtpcr_geo.match.learned.onnx import OnnxExtractor, Running
+
+        model = descriptions(None)[name]
+        assert model.extractor is not None
+        # one thread for each orientation, so that no sum depends on how many there are
+        return OnnxExtractor(model.extractor, path_of(model.extractor.file, model, None), Running("cpu", 1))
+
+    return LearnedProposals(opened, threads or usable_cores())
 
 
 def _classical(name: str, settings: KeypointSettings) -> ImageMatcher:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mtpcr_geo.match.base import Matcher, View
     from mtpcr_geo.match.prior import Prior
 
-_FOR_CORRELATION = {"yaw_step", "patch", "search_radius", "min_overlap"}
+_FOR_CORRELATION = {"yaw_step", "patch", "search_radius", "min_overlap", "proposals"}
 _FOR_KEYPOINTS = {
     "models", "turns", "tolerance", "max_keypoints", "tile", "ratio", "cross_check", "device", "threads",
 }  # fmt: skip
@@ -100,6 +100,11 @@ class MatchOptions(PriorOptions, StageOptions):
         description="where a vertical is not known and the matches under the likeliest one do not convince: "
         "level, rasterise and match again under others, and keep the strongest",
     )
+    proposals: bool = Field(
+        True,
+        description="where neither heights nor terrain settle the search: let the network of the matcher bev "
+        "propose further poses, which are judged like all others",
+    )
     models: Models = None
     turns: int | None = Field(
         None,
@@ -171,7 +176,7 @@ class Match(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Match the source's raster to the target's; under several verticals where none is known."""
-        from mtpcr_geo.pipeline.stages.hypotheses import best_vertical
+        from mtpcr_geo.pipeline.stages.hypotheses import best_vertical, convinces
         from mtpcr_geo.pipeline.stages.rasters import with_rasters
 
         pair = self.one_pair(inputs)
@@ -180,25 +185,41 @@ class Match(Stage):
         if not self.options.verticals or pair.raster is None or known is not None:
             return self._matched(pair, context)
         raster = pair.raster
+        upright = pair.source.levelling.trusted and pair.target.levelling.trusted
         pair, tried = best_vertical(
             pair,
             self.options.seed,
-            lambda one: self._matched(one, context),
-            lambda one: self._matched(with_rasters(one, raster, context)[0], context),
+            lambda one: self._matched(one, context, proposals=upright),
+            lambda one: self._matched(with_rasters(one, raster, context)[0], context, proposals=False),
         )
+        assert pair.matches is not None
+        report = pair.matches.report
+        if not upright and self._may_propose and not convinces(pair.matches):
+            # once, under the vertical that was found likeliest
+            again = self._matched(pair, context)
+            assert again.matches is not None
+            if (again.matches.strength or 0.0) > (pair.matches.strength or 0.0):
+                pair, report = again, again.matches.report
+            self.metadata |= {"matches": _count(pair), **report}
         if tried:
-            assert pair.matches is not None
-            self.metadata |= {"matches": len(pair.matches), **pair.matches.report, "verticals": tried}
+            self.metadata |= {"matches": _count(pair), **report, "verticals": tried}
         return pair
 
-    def _matched(self, pair: Pair, context: RunContext) -> Pair:
+    @property
+    def _may_propose(self) -> bool:
+        return self.options.proposals and self.options.method == "correlation"
+
+    def _matched(self, pair: Pair, context: RunContext, *, proposals: bool = True) -> Pair:
         source, target = bevs_of(self, pair)
         known = known_place(self.options, pair, self.label)
         prior = None if known is None else prior_of(known, pair)
         if known is not None:
             self.metadata["prior"] = audit_of(known, pair)
         trusted = pair.source.levelling.trusted and pair.target.levelling.trusted
-        matcher = self._matcher or self._make(prior, trusted)
+        matcher = kept = self._matcher or self._make(prior, trusted)
+        if self._may_propose and proposals:
+            # who asks again, asks about a pose that is known roughly
+            matcher = self._make(prior, trusted, proposals=True)
         if matcher.needs_one_cell and source.grid.cell != target.grid.cell:
             raise OptionError(
                 f"{self.label}: {self.options.method} needs one cell size, and the rasters have "
@@ -218,19 +239,26 @@ class Match(Stage):
                 advance=advance,
             )
         self.metadata |= {"matches": len(matches.score), **matches.report}
-        return pair.with_(matches=replace(matches, matcher=matcher), known=known)
+        return pair.with_(matches=replace(matches, matcher=kept), known=known)
 
-    def _make(self, prior: Prior | None, trust_vertical: bool = True) -> Matcher:
+    def _make(self, prior: Prior | None, trust_vertical: bool = True, *, proposals: bool = False) -> Matcher:
         from mtpcr_geo.match.correlation import CorrelationSettings
-        from mtpcr_geo.match.registry import CorrelationMatcher, KeypointSettings, make_matcher
+        from mtpcr_geo.match.registry import (
+            CorrelationMatcher,
+            KeypointSettings,
+            learned_proposals,
+            make_matcher,
+        )
 
         o = self.options
+        threads = o.threads or core_limit()
         correlation = CorrelationSettings(
             yaw_step_deg=o.yaw_step,
             patch_m=o.patch,
             search_radius_m=o.search_radius,
             min_overlap_m2=o.min_overlap,
             trust_vertical=trust_vertical,
+            proposals=learned_proposals(threads) if proposals else None,
         )
         if o.method == "correlation":
             return CorrelationMatcher(correlation, prior)
@@ -243,7 +271,7 @@ class Match(Stage):
             ratio=o.ratio,
             cross_check=o.cross_check,
             device=o.device,
-            threads=o.threads or core_limit(),
+            threads=threads,
         )
         return make_matcher(o.method, correlation, keypoints)
 
@@ -298,6 +326,10 @@ class Focus(Stage):
             )
         self.metadata |= matches.report["focus"]
         return pair.with_(matches=matches)
+
+
+def _count(pair: Pair) -> int:
+    return 0 if pair.matches is None else len(pair.matches)
 
 
 def shown(side: Side) -> Side:
