@@ -112,8 +112,7 @@ def _match(
         twin.catch_up(search)
         null_ratio = search.pool.over(twin.pool)
     best = pool.candidates[0]
-    patches = best.patches
-    assert patches is not None  # hypotheses in a pool are judged by patches
+    patches = search.judge.tie_points(best)
     pivot = centre_of(source.grid)
     radius = search.judge.radius_cells * source.grid.cell - source.grid.cell / 2
     report = {

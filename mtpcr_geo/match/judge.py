@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,6 +31,8 @@ not be asked: the margin could not fall below this."""
 MAX_RADIUS_CELLS = 10
 WIDE_PATCH_CELLS = 24
 """Cells along a patch from which the first look at a hypothesis is taken at cells twice as large."""
+FEWEST_PATCHES, LEAST_PATCH_CELLS = 16, 16
+"""Patches in the overlap below which tie points come of patches half as large, and cells along these."""
 LEAST_FILL = 0.25
 """Share of a patch's cells that must be filled in both rasters; half of what is usual in thin ones."""
 FAINT = 3.0
@@ -115,6 +117,18 @@ class Judge:
         if rescored.score >= pose.score:
             pose = rescored
         return Candidate(pose, *self._patches(1, pose, self.radius_cells), self._compare_ground(pose))
+
+    def tie_points(self, best: Candidate) -> PatchMatches:
+        """Return the patches of a hypothesis, smaller ones where the overlap holds few of the usual size.
+
+        The size of a patch follows from the extent of the clouds; of what they share it may be a third.
+        """
+        patches = best.patches
+        assert patches is not None  # hypotheses in a pool are judged by patches
+        smaller = self.patch_m / 2
+        if patches.patches >= FEWEST_PATCHES or smaller < LEAST_PATCH_CELLS * self.scales.cell_m:
+            return patches
+        return replace(self, patch_m=smaller)._patches(1, best.pose, self.radius_cells)[0]
 
     @property
     def _agree_m(self) -> float:
