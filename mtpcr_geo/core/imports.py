@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +30,15 @@ def import_ahead(names: Iterable[str]) -> None:
         # the result is not asked for, and an exception is part of it
         worker.submit(importlib.import_module, name)
     worker.shutdown(wait=False)
+
+
+def search_path() -> list[str]:
+    """Return where this process looks for modules, for one that it starts; no folders that are packages.
+
+    While another thread imports OpenCV its own folder stands before the standard library, and holds a
+    ``typing``: a process that starts then would take that for Python's.
+    """
+    return [path for path in sys.path if not os.path.isfile(os.path.join(path, "__init__.py"))]
 
 
 @contextmanager

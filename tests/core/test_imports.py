@@ -6,11 +6,12 @@ import importlib
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import pytest
 
 from mtpcr_geo.core import imports
-from mtpcr_geo.core.imports import import_ahead
+from mtpcr_geo.core.imports import import_ahead, search_path
 from mtpcr_geo.pipeline.registry import stage_types
 
 
@@ -58,3 +59,23 @@ def test_a_package_may_be_left_out():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["missing", "True"]
+
+
+def test_a_process_that_starts_while_opencv_is_imported_finds_pythons_own_modules(monkeypatch):
+    """OpenCV puts its own folder before the standard library for as long as it is imported."""
+    import cv2
+
+    folder = str(Path(cv2.__file__).parent)
+    monkeypatch.setattr(sys, "path", [sys.path[0], folder, *sys.path[1:]])
+    code = "import sys; sys.path[:] = {path!r}; import typing; print(typing.__file__)"
+
+    def found(path: list[str]) -> subprocess.CompletedProcess[str]:
+        return subprocess.run([sys.executable, "-c", code.format(path=path)], capture_output=True, text=True)
+
+    assert folder not in search_path()
+    assert set(search_path()) <= set(sys.path)
+    done = found(search_path())
+    assert done.returncode == 0, done.stderr
+    assert "cv2" not in done.stdout
+    # what it is for: with the path as it stands another `typing` is found
+    assert "cv2" in (there := found(list(sys.path))).stdout or there.returncode

@@ -37,6 +37,8 @@ RARE = {
     "mtpcr.refine tilt_deg",
     # where surfaces and tie points contradicted each other
     "mtpcr.refine matched_again_cell_m",
+    # of matchers that describe all places
+    "mtpcr.match agreeing_by_chance",
     # of a registration in a survey; tests/survey holds them to a run
     *(key for key in KEYS if key.startswith("mtpcr.match survey.") or key.endswith("_at_the_place")),
     # where several verticals were tried

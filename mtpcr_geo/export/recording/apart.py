@@ -21,6 +21,7 @@ import numpy as np
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import ArrayCloud, Cloud
 from mtpcr_geo.core.errors import OutputError
+from mtpcr_geo.core.imports import search_path
 from mtpcr_geo.core.types import Matches
 from mtpcr_geo.export.recording.budget import Budget
 
@@ -47,7 +48,7 @@ class RemoteWriter:
         self._path = path
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the process
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _START.format(path=sys.path)],
+            [sys.executable, "-c", _START.format(path=search_path())],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._said,

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core.errors import MissingPartError
+from mtpcr_geo.core.imports import search_path
 from mtpcr_geo.pipeline.pdal.switches import Access, environment
 
 INSTALL = (
@@ -256,7 +257,7 @@ def _start(access: Access) -> tuple[dict[str, str], str]:
     """Return the environment and the folder that a process would start in."""
     # the same packages as here, of which the current folder is one only where it was named
     package = str(Path(__file__).resolve().parents[3])
-    paths = dict.fromkeys([*filter(None, sys.path), package])
+    paths = dict.fromkeys([*filter(None, search_path()), package])
     return {**environment(access), "PYTHONPATH": os.pathsep.join(paths)}, os.getcwd()
 
 
