@@ -21,7 +21,7 @@ from mtpcr_geo.match.patches import PatchMatches, match_patches
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.pyramid import Pyramid
 from mtpcr_geo.match.search import Layer, score_nearby
-from mtpcr_geo.match.terrain import GroundComparison, Terrain, compare_ground
+from mtpcr_geo.match.terrain import GroundComparison, Terrain, compare_ground, fewest_of
 from mtpcr_geo.method.scales import Scales
 from mtpcr_geo.method.solve import iterative_svd, ransac_upright
 
@@ -147,7 +147,8 @@ class Judge:
 
     def _compare_ground(self, pose: Pose) -> GroundComparison:
         hypothesis = pose.hypothesis(centre_of(self.pyramid.source.grid))
-        return compare_ground(*self.ground, hypothesis, plane=not self.trust_vertical)
+        fewest = fewest_of(self.ground[1].grid.cell, self.scales.terrain_cell_m)
+        return compare_ground(*self.ground, hypothesis, plane=not self.trust_vertical, fewest=fewest)
 
 
 def _corrected(

@@ -26,9 +26,9 @@ NOISE_M = 0.1
 """Spread of the ground's height differences below which cells, borders and noise leave nothing to compare."""
 FEWEST_CELLS = 8
 FINER_PARTS = (8, 4, 2)
-LEAST_SEEN = 0.1
-"""Parts of the terrain's cell in which grounds may be compared, finest first, and the share of the ground's
-area that must show in them."""
+LEAST_SEEN, LEAST_PART = 0.1, 0.2
+"""Parts of the terrain's cell in which grounds may be compared, finest first; the share of the ground's area
+that must show in them; and the part of the fewest cells' area that they must show under a pose."""
 MOST_CELLS = 10_000
 """Cells of the source that are compared at most: every so many-th of more."""
 SETTLING_STEPS, STILL_CELLS = 15, 0.002
@@ -68,16 +68,18 @@ class GroundComparison:
     Attributes:
         cells: cells compared, of `MOST_CELLS` of the source at most.
         spread_m: robust standard deviation of their height differences, after one shift or one plane.
+        fewest: cells that are ground enough to compare.
 
     """
 
     cells: int
     spread_m: float
+    fewest: int = FEWEST_CELLS
 
     @property
     def known(self) -> bool:
         """Whether there was enough ground to compare."""
-        return self.cells >= FEWEST_CELLS
+        return self.cells >= self.fewest
 
 
 def cell_to_compare(source: Bev, target: Bev, coarsest_m: float) -> float:
@@ -103,21 +105,39 @@ def cell_to_compare(source: Bev, target: Bev, coarsest_m: float) -> float:
     return coarsest_m
 
 
+def fewest_of(cell_m: float, coarsest_m: float) -> int:
+    """Return how many cells are ground enough to compare: a part of the area of `FEWEST_CELLS` coarse ones.
+
+    Args:
+        cell_m: edge of a cell, metres.
+        coarsest_m: edge of a cell of the terrain, metres.
+
+    """
+    return max(FEWEST_CELLS, int(np.ceil(FEWEST_CELLS * LEAST_PART * (coarsest_m / cell_m) ** 2)))
+
+
 def compare_ground(
-    source: Terrain, target: Terrain, hypothesis: Hypothesis, *, plane: bool = False
+    source: Terrain,
+    target: Terrain,
+    hypothesis: Hypothesis,
+    *,
+    plane: bool = False,
+    fewest: int = FEWEST_CELLS,
 ) -> GroundComparison:
     """Compare the shape of both grounds under a pose.
 
     Args:
         source, target: both terrains.
         hypothesis: the pose.
+        fewest: cells that are ground enough to compare.
         plane: remove the best plane of the differences, for clouds whose vertical is not trusted; else
             their median alone.
 
     """
     row, column = np.nonzero(source.mask)
-    every = -(-len(row) // MOST_CELLS)
+    every = max(1, -(-len(row) // MOST_CELLS))
     row, column = row[::every], column[::every]
+    fewest = max(FEWEST_CELLS, -(-fewest // every))
     xy = source.grid.to_metres(np.column_stack([column, row]).astype(np.float64))
     c, s = np.cos(hypothesis.yaw), np.sin(hypothesis.yaw)
     placed = xy @ np.array([[c, s], [-s, c]]) + hypothesis.shift
@@ -127,12 +147,12 @@ def compare_ground(
     known = weight > KNOWN
     cells = int(known.sum())
     if cells < FEWEST_CELLS:
-        return GroundComparison(cells, np.inf)
+        return GroundComparison(cells, np.inf, fewest)
     height = cv2.remap(target.low, x, y, cv2.INTER_LINEAR)[:, 0]
     step = (height - source.low[row, column])[known].astype(np.float64)
     rest = _without_plane(placed[known], step) if plane and cells >= 3 * FEWEST_CELLS else step
     rest = rest - np.median(rest)
-    return GroundComparison(cells, 1.4826 * float(np.median(np.abs(rest))))
+    return GroundComparison(cells, 1.4826 * float(np.median(np.abs(rest))), fewest)
 
 
 def _without_plane(xy: Floats, step: Floats) -> Floats:
