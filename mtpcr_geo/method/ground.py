@@ -94,7 +94,8 @@ def connected_ground(low: Image, ground: Mask, cell: float) -> Mask:
     if not seen_well.any():
         return ground
     rise = float(np.quantile(_rise_of(heights, seen_well, window / 2.0)[seen_well], 0.5)) / cell
-    ground &= ~_sunken(heights, ground, window, np.float32(ABOVE_M + min(rise, STEEPEST) * SUPPORT_M / 2))
+    most = np.float32(ABOVE_M + min(rise, STEEPEST) * SUPPORT_M / 2)
+    ground = ground & ~_sunken(heights, ground, window, most)
     seen_well &= ground
     if not seen_well.any():
         return ground

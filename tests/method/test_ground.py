@@ -75,7 +75,9 @@ def test_crowns_that_stand_apart_are_no_ground(slope: float) -> None:
     opened = ground_cells(low, 0.5)
     # nothing lower is near
     assert opened[crowns].any()
+    given = opened.copy()
     ground = connected_ground(low, opened, 0.5)
+    assert np.array_equal(opened, given), "what is given is changed"
     assert not ground[crowns].any()
     assert ground[70:95].mean() > 0.98
     assert not (ground & ~opened).any()
@@ -97,7 +99,11 @@ def test_what_lies_below_a_street_is_no_ground(below: tuple[int, slice]) -> None
     low, _ = seen_from_a_street()
     low[95] = plane(0.02)[95]
     low[below] -= np.float32(2.0)
-    ground = connected_ground(low, ground_cells(low, 0.5), 0.5)
+    opened = ground_cells(low, 0.5)
+    given = opened.copy()
+    ground = connected_ground(low, opened, 0.5)
+    assert np.array_equal(opened, given), "what is given is changed"
+    assert opened[below].any()
     assert not ground[below].any()
     assert ground[70:94].mean() > 0.95
 
