@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
 from mtpcr_geo.core import transforms
@@ -179,6 +178,9 @@ def _compared(source: Places, target: Places) -> _Pairs:
 
 def _peaks(one: TurnedPlaces, pairs: _Pairs, target: Places, middle: Floats, half: float) -> Iterator[Pose]:
     """Yield the strongest shifts of every yaw of an orientation as poses of the middle."""
+    # takes half a second, which a search that asks no network does not wait for
+    import scipy.fft
+
     if not len(pairs.weight) or pairs.variance <= 0.0:
         return
     edge = target.step_m / 2

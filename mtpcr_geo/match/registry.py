@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING, Literal
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import Matches
-from mtpcr_geo.match.base import Advance, ImageMatcher, Matcher, View
+from mtpcr_geo.match.base import Advance, Matcher, View
 from mtpcr_geo.match.correlation import CorrelationSettings
-from mtpcr_geo.match.descriptors import Extractor, FeatureMatcher, NearestNeighbours, Orb, RootSift
-from mtpcr_geo.match.keypoints import KeypointMatcher
 from mtpcr_geo.match.learned.model_cards import ModelDescription, descriptions, models_folder, path_of
 from mtpcr_geo.match.prior import Prior
 
 if TYPE_CHECKING:
+    # of matchers by keypoints; the default one does without, and is not to wait for them
+    from mtpcr_geo.match.base import ImageMatcher
+    from mtpcr_geo.match.descriptors import Extractor
+    from mtpcr_geo.match.keypoints import KeypointMatcher
     from mtpcr_geo.match.learned.proposals import LearnedProposals
 
 BUILT_IN = ("correlation", "rootsift", "orb")
@@ -100,6 +102,12 @@ def make_matcher(name: str, correlation: CorrelationSettings, keypoints: Keypoin
     """
     if name == "correlation":
         return CorrelationMatcher(correlation)
+    return _by_keypoints(name, keypoints)
+
+
+def _by_keypoints(name: str, keypoints: KeypointSettings) -> KeypointMatcher:
+    from mtpcr_geo.match.keypoints import KeypointMatcher
+
     if name in ("rootsift", "orb"):
         return KeypointMatcher(name, _classical(name, keypoints), tolerance_m=keypoints.tolerance_m)
     folder = models_folder(keypoints.models)
@@ -143,6 +151,8 @@ def learned_proposals(threads: int = 0, name: str = "bev") -> LearnedProposals:
 
 
 def _classical(name: str, settings: KeypointSettings) -> ImageMatcher:
+    from mtpcr_geo.match.descriptors import FeatureMatcher, NearestNeighbours, Orb, RootSift
+
     most = settings.max_keypoints or 8192
     extractor: Extractor = RootSift(most) if name == "rootsift" else Orb(most)
     ratio = RATIO if settings.ratio is None else settings.ratio
@@ -150,6 +160,7 @@ def _classical(name: str, settings: KeypointSettings) -> ImageMatcher:
 
 
 def _learned(model: ModelDescription, folder: Path | None, settings: KeypointSettings) -> ImageMatcher:
+    from mtpcr_geo.match.descriptors import FeatureMatcher, NearestNeighbours
     from mtpcr_geo.match.learned.lightglue import FusedLightGlue, LightGlue
     from mtpcr_geo.match.learned.onnx import OnnxExtractor, Running
 

@@ -13,6 +13,7 @@ from mtpcr_geo.export import drawing
 
 _QUALITY = 82
 _LARGEST_SIDE = 1100
+OPAQUE = 255
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,8 @@ def data_uri(picture: drawing.Picture, *, exact: bool = False) -> str:
 
     """
     if picture.ndim == 3:
-        order = [2, 1, 0, 3] if picture.shape[2] == 4 else [2, 1, 0]
+        seen_through = picture.shape[2] == 4 and (exact or bool((picture[..., 3] < OPAQUE).any()))
+        order = [2, 1, 0, 3] if seen_through else [2, 1, 0]
         picture = np.ascontiguousarray(picture[..., order])
     if exact:
         kind, options = "png", [cv2.IMWRITE_PNG_COMPRESSION, 6]
