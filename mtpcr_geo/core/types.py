@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -230,6 +230,8 @@ class Matches(ComparesArrays):
             matchers that have none.
         matcher: what found them, so that FOCUS can ask it again.
         before_focus: the matches of the first pass, where FOCUS replaced them.
+        complete: carries on a search that was left off, and returns its matches; it is given what is called
+            with 1 after each yaw searched. None where there is nothing more to do.
 
     """
 
@@ -250,6 +252,7 @@ class Matches(ComparesArrays):
     target_keypoints: Floats | None = None
     matcher: Any = None
     before_focus: Matches | None = None
+    complete: Callable[[Callable[[int], object]], Matches] | None = None
 
     def __len__(self) -> int:
         return len(self.score)

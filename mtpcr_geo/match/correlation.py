@@ -9,8 +9,9 @@ what chance and self-similarity score on this pair.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from mtpcr_geo.match.exploration import (
     MIRRORED_HYPOTHESES,
     CorrelationSettings,
     Exploration,
+    Step,
+    proposing,
     steps_of,
 )
 from mtpcr_geo.match.pose import centre_of
@@ -44,6 +47,8 @@ def match(
     seed: int = 0,
     advance: Callable[[int], object] = lambda n: None,
     prior: Prior | None = None,
+    *,
+    provisional: bool = False,
 ) -> Matches:
     """Match two height rasters of unknown relative yaw and shift.
 
@@ -56,6 +61,9 @@ def match(
         seed: of the sampling when patches vote.
         advance: called with 1 after each yaw searched.
         prior: what is known of the pose; None to search everywhere.
+        provisional: of a search that does not settle, leave to `Matches.complete` what is dear and tells
+            nothing of which of several verticals is right: the network's proposals, and the mirrored source
+            where the best pose does not stand out.
 
     Returns:
         Local matches under the best hypothesis (possibly few), and all hypotheses, best first.
@@ -65,95 +73,149 @@ def match(
 
     """
     if prior is None and (source.count > 0).sum() > (target.count > 0).sum():
-        return exchanged(match(target, source, settings, seed, advance))
+        return exchanged(match(target, source, settings, seed, advance, provisional=provisional))
     with opencv_in_one_thread():
-        return _match(source, target, settings, seed, advance, prior)
+        search = _Search(source, target, settings, seed, advance, prior)
+        search.search()
+        if not provisional:
+            search.propose()
+        return search.matches(provisional=provisional)
 
 
-def _match(
-    source: Bev,
-    target: Bev,
-    settings: CorrelationSettings,
-    seed: int,
-    advance: Callable[[int], object],
-    prior: Prior | None,
-) -> Matches:
-    scales = scales_of(source, target)
-    search = Exploration(source, target, scales, settings, seed, advance, prior)
-    twin = None
-    if settings.mirrored_null:
-        null = None if prior is None else prior.mirrored()
-        mirrored = mirror(source)
-        twin = Exploration(
-            mirrored, target, scales, settings, seed, advance, null, search, MIRRORED_HYPOTHESES
+class _Search:
+    """The search of a source and, as far as that tells something, of its mirror image."""
+
+    def __init__(
+        self,
+        source: Bev,
+        target: Bev,
+        settings: CorrelationSettings,
+        seed: int,
+        advance: Callable[[int], object],
+        prior: Prior | None,
+    ) -> None:
+        self.source, self.target, self.settings, self.prior = source, target, settings, prior
+        scales = scales_of(source, target)
+        self.found = Exploration(source, target, scales, settings, seed, advance, prior)
+        self.twin: Exploration | None = None
+        self.settled = False
+        if settings.mirrored_null:
+            null = None if prior is None else prior.mirrored()
+            self.twin = Exploration(
+                mirror(source), target, scales, settings, seed, advance, null, self.found, MIRRORED_HYPOTHESES
+            )
+
+    def search(self) -> None:
+        """Search level after level until it is settled."""
+        self._take(steps_of(search_factors(self.source, self.target)))
+
+    def propose(self) -> None:
+        """Let others propose where the search did not settle; not where a prior says where to look."""
+        if self.settings.proposals is not None and self.prior is None and not self.settled:
+            self._take([proposing(search_factors(self.source, self.target))])
+
+    def _take(self, steps: Iterable[Step]) -> None:
+        search, twin = self.found, self.twin
+        for step in steps:
+            if not search.explore(step):
+                continue
+            self.settled = settled = search.settles()
+            if settled and (twin is None or search.asked_terrain):
+                return
+            if twin is None:
+                continue
+            needed = None
+            if settled or (search.asked_terrain and search.promises()):
+                needed = CONVINCING_NULL_RATIO
+            elif search.leads():
+                needed = CLEAR_LEAD
+            if needed is not None:
+                twin.catch_up(search)
+                self.settled = search.pool.over(twin.pool) >= needed
+                if self.settled:
+                    return
+        self.settled = False
+
+    def matches(self, *, provisional: bool = False) -> Matches:
+        """Return what was found.
+
+        Raises:
+            RegistrationError: if there is nothing to compare.
+
+        """
+        search, twin, source = self.found, self.twin, self.source
+        pool = search.pool
+        if not pool.candidates:
+            raise RegistrationError(
+                nothing_to_compare(source, self.target, search.fewest(1), self.prior is not None)
+            )
+        left_off = provisional and not self.settled
+        if left_off and pool.margin < self.settings.convincing_margin:
+            twin = None
+        null_ratio = None
+        if twin is not None:
+            twin.catch_up(search)
+            null_ratio = pool.over(twin.pool)
+        best = pool.candidates[0]
+        patches = search.judge.tie_points(best)
+        pivot = centre_of(source.grid)
+        radius = search.judge.radius_cells * source.grid.cell - source.grid.cell / 2
+        return Matches(
+            source_px=patches.source_px,
+            target_px=patches.target_px,
+            score=np.clip(patches.score, 0.0, 1.0),
+            hypotheses=tuple(
+                replace(c.pose.hypothesis(pivot), strength=strength)
+                for c, strength in zip(pool.candidates, pool.strengths, strict=True)
+            ),
+            search_radius_m=radius,
+            margin=pool.margin,
+            support=best.support,
+            null_ratio=null_ratio,
+            strength=best.strength,
+            mirrored_strengths=None if twin is None else tuple(c.strength for c in twin.pool.candidates),
+            repeats=search.repeats(),
+            report=self._report(patches.patches, radius, twin, null_ratio),
+            complete=self._completed if left_off else None,
         )
-    proposals = settings.proposals is not None and prior is None
-    for step in steps_of(search_factors(source, target), proposals):
-        if not search.explore(step):
-            continue
-        settled = search.settles()
-        if settled and (twin is None or search.asked_terrain):
-            break
-        if twin is None:
-            continue
-        if settled or (search.asked_terrain and search.promises()):
-            twin.catch_up(search)
-            if search.pool.over(twin.pool) >= CONVINCING_NULL_RATIO:
-                break
-        elif search.leads():
-            twin.catch_up(search)
-            if search.pool.over(twin.pool) >= CLEAR_LEAD:
-                break
-    pool = search.pool
-    if not pool.candidates:
-        raise RegistrationError(nothing_to_compare(source, target, search.fewest(1), prior is not None))
-    null_ratio = None
-    if twin is not None:
-        twin.catch_up(search)
-        null_ratio = search.pool.over(twin.pool)
-    best = pool.candidates[0]
-    patches = search.judge.tie_points(best)
-    pivot = centre_of(source.grid)
-    radius = search.judge.radius_cells * source.grid.cell - source.grid.cell / 2
-    report = {
-        "cell_m": source.grid.cell,
-        "extent_m": scales.extent_m,
-        "patch_m": scales.patch_m if settings.patch_m is None else settings.patch_m,
-        "search_radius_m": radius,
-        "searched": [{"cell_m": level.cell_m, "scores": list(level.scores)} for level in search.levels],
-        "margin": pool.margin,
-        "support": best.support,
-        "neg_log10_p": best.neg_log10_p,
-        "support_next": max((c.support for c in pool.candidates[1:]), default=0.0),
-        "patches": patches.patches,
-        "scores": [round(c.pose.score, 3) for c in pool.candidates],
-        "strengths": [round(strength, 3) for strength in pool.strengths],
-        "ground_spread_m": [
-            round(c.ground.spread_m, 3) if c.ground is not None and c.ground.known else None
-            for c in pool.candidates
-        ],
-        "mirrored_strengths": None if twin is None else [round(c.strength, 3) for c in twin.pool.candidates],
-        "null_ratio": null_ratio,
-        "self_likeness": search.likeness,
-        "by_proposals": search.proposed,
-    }
-    return Matches(
-        source_px=patches.source_px,
-        target_px=patches.target_px,
-        score=np.clip(patches.score, 0.0, 1.0),
-        hypotheses=tuple(
-            replace(c.pose.hypothesis(pivot), strength=strength)
-            for c, strength in zip(pool.candidates, pool.strengths, strict=True)
-        ),
-        search_radius_m=radius,
-        margin=pool.margin,
-        support=best.support,
-        null_ratio=null_ratio,
-        strength=best.strength,
-        mirrored_strengths=None if twin is None else tuple(c.strength for c in twin.pool.candidates),
-        repeats=search.repeats(),
-        report=report,
-    )
+
+    def _completed(self, advance: Callable[[int], object]) -> Matches:
+        for one in (self.found, self.twin):
+            if one is not None:
+                one.advance = advance
+        with opencv_in_one_thread():
+            self.propose()
+            return self.matches()
+
+    def _report(
+        self, patches: int, radius_m: float, twin: Exploration | None, null_ratio: float | None
+    ) -> dict[str, Any]:
+        search, pool, settings = self.found, self.found.pool, self.settings
+        best = pool.candidates[0]
+        return {
+            "cell_m": self.source.grid.cell,
+            "extent_m": search.scales.extent_m,
+            "patch_m": search.scales.patch_m if settings.patch_m is None else settings.patch_m,
+            "search_radius_m": radius_m,
+            "searched": [{"cell_m": level.cell_m, "scores": list(level.scores)} for level in search.levels],
+            "margin": pool.margin,
+            "support": best.support,
+            "neg_log10_p": best.neg_log10_p,
+            "support_next": max((c.support for c in pool.candidates[1:]), default=0.0),
+            "patches": patches,
+            "scores": [round(c.pose.score, 3) for c in pool.candidates],
+            "strengths": [round(strength, 3) for strength in pool.strengths],
+            "ground_spread_m": [
+                round(c.ground.spread_m, 3) if c.ground is not None and c.ground.known else None
+                for c in pool.candidates
+            ],
+            "mirrored_strengths": None
+            if twin is None
+            else [round(c.strength, 3) for c in twin.pool.candidates],
+            "null_ratio": null_ratio,
+            "self_likeness": search.likeness,
+            "by_proposals": search.proposed,
+        }
 
 
 def exchanged(matches: Matches) -> Matches:
@@ -164,8 +226,10 @@ def exchanged(matches: Matches) -> Matches:
         east, north = one.shift
         back = (float(-(c * east + s * north)), float(s * east - c * north))
         hypotheses.append(replace(one, yaw=-one.yaw, shift=back))
+    complete = matches.complete
     return replace(
         matches,
+        complete=None if complete is None else lambda advance: exchanged(complete(advance)),
         source_px=matches.target_px,
         target_px=matches.source_px,
         hypotheses=tuple(hypotheses),

@@ -107,12 +107,11 @@ class Step:
         return self.by == "terrain"
 
 
-def steps_of(factors: list[int], proposals: bool = False) -> Iterator[Step]:
-    """Give the steps of a search in order: the terrain is asked on the first level, others' proposals last.
+def steps_of(factors: list[int]) -> Iterator[Step]:
+    """Give the steps of a search in order: the terrain is asked on the first level.
 
     Args:
         factors: cells of the levels, as multiples of the finest, coarsest first.
-        proposals: whether somebody else proposes.
 
     """
     for number, factor in enumerate(factors):
@@ -120,8 +119,11 @@ def steps_of(factors: list[int], proposals: bool = False) -> Iterator[Step]:
             yield Step(factor, part)
             if number == 0:
                 yield Step(factor, part, "terrain")
-    if proposals:
-        yield Step(factors[len(factors) // 2], 0, "proposals")
+
+
+def proposing(factors: list[int]) -> Step:
+    """Return the step by which others propose, after all of `steps_of`."""
+    return Step(factors[len(factors) // 2], 0, "proposals")
 
 
 class Exploration:

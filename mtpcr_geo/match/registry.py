@@ -59,11 +59,13 @@ class CorrelationMatcher:
     Attributes:
         settings: what governs the search.
         prior: what is known of the pose beforehand.
+        provisional: whether a search that does not settle is left off, see `Matches.complete`.
 
     """
 
     settings: CorrelationSettings
     prior: Prior | None = None
+    provisional: bool = False
     needs_image: bool = False
     needs_one_cell: bool = True
 
@@ -79,7 +81,9 @@ class CorrelationMatcher:
         """Search all yaws and all shifts, see `Matcher.match`; a known yaw is not made use of."""
         from mtpcr_geo.match.correlation import match
 
-        return match(source.bev, target.bev, self.settings, seed, advance, self.prior)
+        return match(
+            source.bev, target.bev, self.settings, seed, advance, self.prior, provisional=self.provisional
+        )
 
 
 def names(folder: Path | None) -> list[str]:

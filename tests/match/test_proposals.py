@@ -12,7 +12,6 @@ from helpers_scene import town
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.types import Bev, Hypothesis
 from mtpcr_geo.match.correlation import CorrelationSettings, match
-from mtpcr_geo.match.exploration import Step, steps_of
 from mtpcr_geo.match.learned.proposals import COARSEST_CELL_M, LONGEST_PX, PROPOSED
 from mtpcr_geo.match.registry import learned_proposals
 from mtpcr_geo.method.bev import grid_around, rasterise
@@ -53,11 +52,6 @@ def near(one: Hypothesis, other: Hypothesis, at: np.ndarray) -> bool:
     return bool(np.hypot(*(places[0] - places[1])) < 1.0)
 
 
-def test_others_are_asked_last() -> None:
-    assert list(steps_of([8, 4, 2], proposals=True))[:-1] == list(steps_of([8, 4, 2]))
-    assert list(steps_of([8, 4, 2], proposals=True))[-1] == Step(4, 0, "proposals")
-
-
 def test_nobody_is_asked_where_the_search_settles_by_itself() -> None:
     rng = np.random.default_rng(1)
     given = Given()
@@ -91,6 +85,44 @@ def test_a_right_pose_that_is_proposed_is_found(strip: tuple[Bev, Bev, Hypothesi
     assert found.report["by_proposals"]
     # the mirrored source is given what was proposed for it
     assert given.asked == 2
+
+
+def test_a_search_that_is_left_off_and_carried_on_is_the_whole_search(
+    strip: tuple[Bev, Bev, Hypothesis],
+) -> None:
+    # the larger one is given as the source, so that both are exchanged on the way
+    target, source, _ = strip
+    if (source.count > 0).sum() < (target.count > 0).sum():
+        source, target = target, source
+    wrong = Hypothesis(1.0, (30.0, -40.0), 9.0)
+    given = Given(wrong), Given(wrong)
+    whole = match(source, target, CorrelationSettings(min_overlap_share=SHARE, proposals=given[0]))
+    yaws: list[int] = []
+    left_off = match(
+        source, target, CorrelationSettings(min_overlap_share=SHARE, proposals=given[1]), provisional=True
+    )
+    assert left_off.complete is not None
+    assert given[1].asked == 0
+    # nothing is said of chance where the mirrored source was not searched
+    assert left_off.null_ratio is None
+    assert left_off.margin is not None
+    assert left_off.margin < 1.5
+    done = left_off.complete(yaws.append)
+    assert yaws
+    assert given[0].asked == given[1].asked
+    assert done.complete is None
+    assert done.hypotheses == whole.hypotheses
+    assert (done.margin, done.null_ratio, done.report) == (whole.margin, whole.null_ratio, whole.report)
+    assert np.array_equal(done.source_px, whole.source_px)
+    assert np.array_equal(done.target_px, whole.target_px)
+
+
+def test_a_search_that_settles_is_not_left_off() -> None:
+    rng = np.random.default_rng(1)
+    source, target = bev_of(plot(rng), 0.25), bev_of(plot(rng), 0.25)
+    found, whole = (match(source, target, provisional=one) for one in (True, False))
+    assert found.complete is None
+    assert found.null_ratio == whole.null_ratio is not None
 
 
 def test_wrong_poses_that_are_proposed_change_nothing(strip: tuple[Bev, Bev, Hypothesis]) -> None:

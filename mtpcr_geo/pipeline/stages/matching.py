@@ -176,7 +176,7 @@ class Match(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Match the source's raster to the target's; under several verticals where none is known."""
-        from mtpcr_geo.pipeline.stages.hypotheses import best_vertical, convinces
+        from mtpcr_geo.pipeline.stages.hypotheses import best_vertical
         from mtpcr_geo.pipeline.stages.rasters import with_rasters
 
         pair = self.one_pair(inputs)
@@ -189,27 +189,21 @@ class Match(Stage):
         pair, tried = best_vertical(
             pair,
             self.options.seed,
-            lambda one: self._matched(one, context, proposals=upright),
-            lambda one: self._matched(with_rasters(one, raster, context)[0], context, proposals=False),
+            lambda one: self._matched(one, context, provisional=not upright),
+            lambda one: self._matched(with_rasters(one, raster, context)[0], context, provisional=True),
         )
-        assert pair.matches is not None
-        report = pair.matches.report
-        if not upright and self._may_propose and not convinces(pair.matches):
-            # once, under the vertical that was found likeliest
-            again = self._matched(pair, context)
-            assert again.matches is not None
-            if (again.matches.strength or 0.0) > (pair.matches.strength or 0.0):
-                pair, report = again, again.matches.report
-            self.metadata |= {"matches": _count(pair), **report}
+        matches = pair.matches
+        assert matches is not None
+        if matches.complete is not None:
+            # once, under the verticals that were found likeliest
+            with context.progress.task("searching on") as advance:
+                matches = replace(matches.complete(advance), matcher=matches.matcher)
+        self.metadata |= {"matches": len(matches.score), **matches.report}
         if tried:
-            self.metadata |= {"matches": _count(pair), **report, "verticals": tried}
-        return pair
+            self.metadata["verticals"] = tried
+        return pair.with_(matches=matches)
 
-    @property
-    def _may_propose(self) -> bool:
-        return self.options.proposals and self.options.method == "correlation"
-
-    def _matched(self, pair: Pair, context: RunContext, *, proposals: bool = True) -> Pair:
+    def _matched(self, pair: Pair, context: RunContext, *, provisional: bool = False) -> Pair:
         source, target = bevs_of(self, pair)
         known = known_place(self.options, pair, self.label)
         prior = None if known is None else prior_of(known, pair)
@@ -217,9 +211,9 @@ class Match(Stage):
             self.metadata["prior"] = audit_of(known, pair)
         trusted = pair.source.levelling.trusted and pair.target.levelling.trusted
         matcher = kept = self._matcher or self._make(prior, trusted)
-        if self._may_propose and proposals:
+        if self._matcher is None:
             # who asks again, asks about a pose that is known roughly
-            matcher = self._make(prior, trusted, proposals=True)
+            matcher = self._make(prior, trusted, first=True, provisional=provisional)
         if matcher.needs_one_cell and source.grid.cell != target.grid.cell:
             raise OptionError(
                 f"{self.label}: {self.options.method} needs one cell size, and the rasters have "
@@ -241,7 +235,14 @@ class Match(Stage):
         self.metadata |= {"matches": len(matches.score), **matches.report}
         return pair.with_(matches=replace(matches, matcher=kept), known=known)
 
-    def _make(self, prior: Prior | None, trust_vertical: bool = True, *, proposals: bool = False) -> Matcher:
+    def _make(
+        self,
+        prior: Prior | None,
+        trust_vertical: bool = True,
+        *,
+        first: bool = False,
+        provisional: bool = False,
+    ) -> Matcher:
         from mtpcr_geo.match.correlation import CorrelationSettings
         from mtpcr_geo.match.registry import (
             CorrelationMatcher,
@@ -258,10 +259,10 @@ class Match(Stage):
             search_radius_m=o.search_radius,
             min_overlap_m2=o.min_overlap,
             trust_vertical=trust_vertical,
-            proposals=learned_proposals(threads) if proposals else None,
+            proposals=learned_proposals(threads) if o.proposals and first else None,
         )
         if o.method == "correlation":
-            return CorrelationMatcher(correlation, prior)
+            return CorrelationMatcher(correlation, prior, provisional)
         keypoints = KeypointSettings(
             models=o.models,
             turns=o.turns,
@@ -326,10 +327,6 @@ class Focus(Stage):
             )
         self.metadata |= matches.report["focus"]
         return pair.with_(matches=matches)
-
-
-def _count(pair: Pair) -> int:
-    return 0 if pair.matches is None else len(pair.matches)
 
 
 def shown(side: Side) -> Side:
