@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,8 +20,11 @@ RADIUS_TOLERANCES = 4.0
 """How far the final patch matches may lie from where the pose puts them, tolerances."""
 AGREE_TOLERANCES = 1.5
 SAME_YAW_DEG = 5.0
-GROUND_SCALE_M = 0.1
-"""Spread of the ground's height differences, beyond the least of all hypotheses, that halves a strength."""
+GROUND_SCALE_M = 0.05
+"""Spread of the ground's height differences that borders of cells and noise cause, and that says nothing."""
+MOST_TOLD = 16.0
+"""Times at most by which a pose may be likelier for how much less the grounds differ than they vary: beyond
+it neighbouring heights, which go together, would be counted as so many witnesses."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +90,8 @@ class Pool:
     @classmethod
     def of(cls, candidates: Sequence[Candidate], scales: Scales, bound: float = 0.0) -> Pool:
         """Rank candidates by strength and the ground, and join those that came down to the same place."""
-        least = least_spread(candidates)
-        ranked = [(weighed(c, least), c) for c in candidates]
+        ground = GroundWeights.of(candidates)
+        ranked = [(ground.weighed(c), c) for c in candidates]
         ranked.sort(key=lambda one: (-one[0], -one[1].pose.score))
         kept: list[tuple[float, Candidate]] = []
         for strength, candidate in ranked:
@@ -107,45 +110,72 @@ class Pool:
     def over(self, other: Pool) -> float:
         """Return the strength of the best over the greatest of another pool, at least.
 
-        The ground weighs in both alike, held against the least spread of either: a lattice of rows fits the
-        rows of its mirror image as well as its own, but not the terrain beneath.
+        The ground weighs in both alike, held against the best of either: a lattice of rows fits the rows of
+        its mirror image as well as its own, but not the terrain beneath.
         """
-        mine, theirs = (
-            [c for c in pool.candidates if c.ground is not None and c.ground.known] for pool in (self, other)
+        ground = None
+        if all(any(_known(c) for c in pool.candidates) for pool in (self, other)):
+            ground = GroundWeights.of([*self.candidates, *other.candidates])
+        best, *rivals = (
+            c.strength if ground is None else ground.weighed(c)
+            for c in (self.candidates[0], *other.candidates)
         )
-        least = min(least_spread(mine), least_spread(theirs)) if mine and theirs else None
-        if least is None:
-            best, rivals = self.candidates[0].strength, [c.strength for c in other.candidates]
-        else:
-            best = weighed(self.candidates[0], least)
-            rivals = [weighed(c, least) for c in other.candidates]
         return margin_of([best, max(rivals, default=0.0)], floor=other.bound)
 
 
-def weighed(candidate: Candidate, least_m: float) -> float:
-    """Return a hypothesis' strength, times how well the ground agrees.
+@dataclass(frozen=True)
+class GroundWeights:
+    """How the ground weighs hypotheses of one search against each other.
 
-    Args:
-        candidate: the hypothesis.
-        least_m: least spread of the ground's height differences of all hypotheses, metres.
+    Under the right pose both grounds differ by noise, by what grew, and by what either cloud did not see: by
+    about as much as they do under the best hypothesis. Under a wrong one they differ by as much as they vary.
+    Of Gaussian heights with n independent places the likelihood of either is a power of the variance; n is
+    taken to be two, since neighbouring heights go together. A strength is multiplied by the first over the
+    second, and by how much less a pose lets them differ than they vary. So flat ground, which fits anywhere,
+    tells nothing, and steep ground that fits tells most.
+
+    Attributes:
+        least_m: least spread of the ground's height differences of all hypotheses, metres; 0 if unknown.
+        most_told: greatest ratio of what they vary by to what they differ by, both as variances.
+        usual: weight of a hypothesis whose ground is not known: the median of the others.
 
     """
-    return candidate.strength * _ground_factor(candidate.ground, least_m)
+
+    least_m: float = 0.0
+    most_told: float = 1.0
+    usual: float = 1.0
+
+    @classmethod
+    def of(cls, candidates: Sequence[Candidate]) -> GroundWeights:
+        """Weigh by the ground of all candidates of a search."""
+        known = [c.ground for c in candidates if c.ground is not None and c.ground.known]
+        if not known:
+            return cls()
+        weights = cls(min(one.spread_m for one in known), max(_told(one) for one in known))
+        return replace(weights, usual=float(np.median([weights.factor(one) for one in known])))
+
+    def weighed(self, candidate: Candidate) -> float:
+        """Return a hypothesis' strength times its weight, which is 1 at most."""
+        return candidate.strength * self.factor(candidate.ground)
+
+    def factor(self, ground: GroundComparison | None) -> float:
+        """Return the weight of a comparison of both grounds, 0 to 1."""
+        if ground is None or not ground.known:
+            return self.usual
+        noise = GROUND_SCALE_M**2
+        differ = (noise + self.least_m**2) / (noise + ground.spread_m**2)
+        return float(differ * _told(ground) / self.most_told)
 
 
-def least_spread(candidates: Sequence[Candidate]) -> float:
-    """Return the least spread of the ground's height differences of all candidates, metres; 0 if unknown."""
-    known = [c.ground.spread_m for c in candidates if c.ground is not None and c.ground.known]
-    return min(known, default=0.0)
+def _known(candidate: Candidate) -> bool:
+    return candidate.ground is not None and candidate.ground.known
 
 
-def _ground_factor(ground: GroundComparison | None, least_m: float) -> float:
-    """Return 1 where the grounds agree as well as they do anywhere, less where they differ in shape."""
-    scale = GROUND_SCALE_M + least_m
-    full = 1.0 + (least_m / scale) ** 2
-    if ground is None or not ground.known:
-        return 0.5 * full
-    return full / (1.0 + (ground.spread_m / scale) ** 2)
+def _told(ground: GroundComparison) -> float:
+    """Return how much more the grounds vary than they differ, as a ratio of variances; 1 if they do not."""
+    noise = GROUND_SCALE_M**2
+    ratio = (noise + ground.relief_m**2) / (noise + ground.spread_m**2)
+    return float(np.clip(ratio, 1.0, MOST_TOLD))
 
 
 def same_pose(a: Pose, b: Pose, apart_m: float, radius_m: float) -> bool:

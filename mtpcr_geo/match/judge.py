@@ -13,9 +13,8 @@ from mtpcr_geo.match.candidates import (
     AGREE_TOLERANCES,
     RADIUS_TOLERANCES,
     Candidate,
-    least_spread,
+    GroundWeights,
     same_pose,
-    weighed,
 )
 from mtpcr_geo.match.patches import PatchMatches, match_patches
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
@@ -94,7 +93,7 @@ class Judge:
             if pose.score * CLEAR_MARGIN < known:
                 return judged, separate[number:]
             judged.append(self.judge_one(pose, known))
-            known = max(known, weighed(judged[-1], least_spread([*before, *judged])))
+            known = max(known, GroundWeights.of([*before, *judged]).weighed(judged[-1]))
         return judged, []
 
     def judge_one(self, pose: Pose, known: float = 0.0) -> Candidate:

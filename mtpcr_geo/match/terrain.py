@@ -69,12 +69,15 @@ class GroundComparison:
         cells: cells compared, of `MOST_CELLS` of the source at most.
         spread_m: robust standard deviation of their height differences, after one shift or one plane.
         fewest: cells that are ground enough to compare.
+        relief_m: what that would be if neither ground told anything of the other: their own spreads in the
+            cells compared, added in squares.
 
     """
 
     cells: int
     spread_m: float
     fewest: int = FEWEST_CELLS
+    relief_m: float = 0.0
 
     @property
     def known(self) -> bool:
@@ -149,10 +152,16 @@ def compare_ground(
     if cells < FEWEST_CELLS:
         return GroundComparison(cells, np.inf, fewest)
     height = cv2.remap(target.low, x, y, cv2.INTER_LINEAR)[:, 0]
-    step = (height - source.low[row, column])[known].astype(np.float64)
-    rest = _without_plane(placed[known], step) if plane and cells >= 3 * FEWEST_CELLS else step
-    rest = rest - np.median(rest)
-    return GroundComparison(cells, 1.4826 * float(np.median(np.abs(rest))), fewest)
+    heights = [one[known].astype(np.float64) for one in (source.low[row, column], height)]
+    level = placed[known] if plane and cells >= 3 * FEWEST_CELLS else None
+    spread, own, other = (_spread_about(level, one) for one in (heights[1] - heights[0], *heights))
+    return GroundComparison(cells, spread, fewest, float(np.hypot(own, other)))
+
+
+def _spread_about(xy: Floats | None, height: Floats) -> float:
+    """Return the robust spread of (n,) heights about their median, or about a plane over (n, 2) places."""
+    rest = height if xy is None else _without_plane(xy, height)
+    return 1.4826 * float(np.median(np.abs(rest - np.median(rest))))
 
 
 def _without_plane(xy: Floats, step: Floats) -> Floats:
