@@ -10,7 +10,7 @@ from helpers_scene import town
 import mtpcr_geo as mg
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.types import Bev, Hypothesis, Matches
-from mtpcr_geo.match.candidates import Candidate, Pool, same_pose
+from mtpcr_geo.match.candidates import Candidate, GroundWeights, Pool, same_pose
 from mtpcr_geo.match.correlation import CorrelationSettings, match, mirror
 from mtpcr_geo.match.exploration import Exploration, Step
 from mtpcr_geo.match.pose import Pose
@@ -164,6 +164,29 @@ def test_grounds_that_disagree_weigh_a_hypothesis_down() -> None:
     assert Pool.of([], scales).margin == 1.0
     # what was left unjudged may be as strong as its bound
     assert Pool.of([right], scales, bound=20.0).margin == pytest.approx(pool.strengths[0] / 20.0)
+
+
+def test_flat_ground_that_fits_tells_less_than_steep_ground_that_fits() -> None:
+    def judged(strength: float, spread_m: float, relief_m: float, cells: int = 100) -> Candidate:
+        ground = GroundComparison(cells, spread_m, relief_m=relief_m)
+        return _Strong(Pose(0.0, strength, 0.0, strength, 100), ground=ground)
+
+    steep, flat = judged(10.0, 0.09, 0.6), judged(14.0, 0.06, 0.06)
+    far = judged(14.0, 0.6, 0.6)
+    hidden = judged(14.0, np.inf, 0.0, cells=0)
+    weights = GroundWeights.of([steep, flat, far, hidden])
+    ranked = sorted([steep, flat, far, hidden], key=weights.weighed, reverse=True)
+    assert ranked[0] is steep
+    assert ranked[-1] is far
+    # ground that is not seen counts as it does in the middle of the others
+    assert weights.factor(hidden.ground) == weights.factor(flat.ground)
+    # a strength never exceeds what patches give, and where no ground is seen it is that
+    assert all(0.0 < weights.weighed(one) <= one.strength for one in (steep, flat, far, hidden))
+    assert GroundWeights.of([hidden]).weighed(hidden) == hidden.strength
+    # on a plain all poses differ by noise, and hardly one is preferred
+    plain = [judged(10.0, spread, 0.02) for spread in (0.01, 0.02)]
+    level = GroundWeights.of(plain)
+    assert level.weighed(plain[0]) == pytest.approx(level.weighed(plain[1]), rel=0.25)
 
 
 def test_poses_are_one_where_they_move_the_rim_alike() -> None:

@@ -142,7 +142,11 @@ def test_the_true_pose_has_the_least_spread(source: np.ndarray, target: np.ndarr
     at = pose_of(TRUE, pivot)
     for turn, east, north in ((0.0, 16.0, 0.0), (0.0, 0.0, -16.0), (20.0, 0.0, 0.0), (180.0, 0.0, 0.0)):
         wrong = Pose(at.yaw + np.radians(turn), at.east + east, at.north + north).hypothesis(pivot)
-        assert compare_ground(s, t, wrong).spread_m > 2 * true.spread_m
+        found = compare_ground(s, t, wrong)
+        assert found.spread_m > 2 * true.spread_m
+        # grounds that have nothing to do with each other differ by as much as they vary
+        assert 0.3 < found.spread_m / found.relief_m < 2.0
+    assert true.relief_m > 8 * true.spread_m
 
 
 def test_a_tilt_is_taken_out_where_the_vertical_is_not_trusted(
