@@ -17,6 +17,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.types import Bev, Levelling, Pair, Refinement, Side
+from mtpcr_geo.method.icp import Surfaces, rounds_for
 from mtpcr_geo.method.inverse_mapping import tie_points_of
 from mtpcr_geo.method.refine import RefineSettings, refine
 from mtpcr_geo.method.scales import tolerance_for
@@ -33,6 +34,9 @@ cells hold twice as many points, and small plots still have cells enough."""
 SURE = 1.3
 """Strength over the next hypothesis, and over the mirrored source's best, below which the pose itself is in
 doubt, and no second search about a cell or two is worth its time."""
+BETTER = 0.95
+"""Share of the surfaces' residual that is left at most under a place that neither the first tie points nor
+the surfaces by themselves had led to."""
 WEAKEST, CLOSER = 0.5, 0.8
 """Share of the first matches' strength that those under a new vertical have at least, and of the surfaces'
 residual that is left at most where they are weaker: of a right one under 0.5 is left."""
@@ -123,7 +127,8 @@ def matched_coarser(
 
     Either the surfaces are right, which many more points have seen, or they slid along open ground or along
     rows. Tie points found anew, on rasters whose cells hold twice as many points, decide which: only where
-    they match better and agree with the place that the surfaces chose is it taken.
+    they match better, and agree with the place that the surfaces chose or lead to one where these meet
+    clearly better still, is it taken.
 
     Args:
         pair: solved, with matches and rasters.
@@ -172,10 +177,25 @@ def matched_coarser(
     met = refinement.icp
     if met is None or not met.followed or met.contested:
         return None
-    if _apart_m(pair, refinement.T, icp.T_surfaces) > tolerance_for(pair.cell):
+    elsewhere = _apart_m(pair, refinement.T, icp.T_surfaces) > tolerance_for(pair.cell)
+    if elsewhere and (matches.repeats or not _meet_better(pair, refined.T, refinement.T, settings)):
         return None
     why = f"matched and solved again in cells of {cell:g} m: surfaces met better beside the first tie points"
     return again.with_(T_target_source=refinement.T, refinement=replace(refinement, again=why))
+
+
+def _meet_better(pair: Pair, before: Floats, after: Floats, settings: RefineSettings) -> bool:
+    """Return whether the same surfaces, those of the overlap before, meet clearly better after."""
+    distance = max(max(one.max_correspondence_distances_m) for one in rounds_for(pair.cell).values())
+    surfaces = Surfaces(
+        pair.source.sample,
+        pair.target.sample,
+        before,
+        voxel_m=settings.voxel_m,
+        max_correspondence_distance_m=distance,
+        max_points=settings.max_points,
+    )
+    return surfaces.surface_residual(after) <= BETTER * surfaces.surface_residual(before)
 
 
 def _apart_m(pair: Pair, A: Floats, B: Floats) -> float:
