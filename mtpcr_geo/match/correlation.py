@@ -119,13 +119,15 @@ class _Search:
         for step in steps:
             if not search.explore(step):
                 continue
-            self.settled = settled = search.settles()
-            if settled and (twin is None or search.asked_terrain):
-                return
+            self.settled = search.settles()
             if twin is None:
+                if self.settled:
+                    return
                 continue
+            # what chance gives on this pair is asked before a pose is believed: among rows a wrong one may
+            # stand out from all that was judged so far
             needed = None
-            if settled or (search.asked_terrain and search.promises()):
+            if self.settled or (search.asked_terrain and search.promises()):
                 needed = CONVINCING_NULL_RATIO
             elif search.leads():
                 needed = CLEAR_LEAD
