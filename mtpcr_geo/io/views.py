@@ -22,8 +22,9 @@ Floats = NDArray[np.float64]
 Box = tuple[tuple[float, float], ...]
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_RANGE = re.compile(rf"\[\s*({_NUMBER})\s*,\s*({_NUMBER})\s*\]")
-_BOUNDS = re.compile(rf"\(\s*{_RANGE.pattern}(?:\s*,\s*{_RANGE.pattern}){{1,2}}\s*\)\Z")
+_RANGE = rf"\[\s*({_NUMBER})\s*,\s*({_NUMBER})\s*\]"
+# compiled where it is used first, which takes longer than reading the rest of this module
+_BOUNDS = rf"\(\s*{_RANGE}(?:\s*,\s*{_RANGE}){{1,2}}\s*\)\Z"
 
 
 def parse_bounds(text: str) -> Box:
@@ -34,9 +35,9 @@ def parse_bounds(text: str) -> Box:
 
     """
     text = text.strip()
-    if not _BOUNDS.match(text):
+    if not re.match(_BOUNDS, text):
         raise ValueError('bounds are written "([xmin, xmax], [ymin, ymax])", with [zmin, zmax] for height')
-    box = tuple((float(low), float(high)) for low, high in _RANGE.findall(text))
+    box = tuple((float(low), float(high)) for low, high in re.findall(_RANGE, text))
     if any(low > high for low, high in box):
         raise ValueError("a minimum of the bounds is above its maximum")
     return box
