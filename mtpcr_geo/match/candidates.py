@@ -25,6 +25,8 @@ GROUND_SCALE_M = 0.05
 MOST_TOLD = 16.0
 """Times at most by which a pose may be likelier for how much less the grounds differ than they vary: beyond
 it neighbouring heights, which go together, would be counted as so many witnesses."""
+LUCKY = 5.0
+"""Times the fewest cells that are ground enough to compare: with these its logarithm counts by half."""
 
 
 @dataclass(frozen=True)
@@ -129,21 +131,20 @@ class GroundWeights:
 
     Under the right pose both grounds differ by noise, by what grew, and by what either cloud did not see: by
     about as much as they do under the best hypothesis. Under a wrong one they differ by as much as they vary.
-    Of Gaussian heights with n independent places the likelihood of either is a power of the variance; n is
-    taken to be two, since neighbouring heights go together. A strength is multiplied by the first over the
-    second, and by how much less a pose lets them differ than they vary. So flat ground, which fits anywhere,
-    tells nothing, and steep ground that fits tells most.
+    Of Gaussian heights with n independent places the likelihood of either is a power of the variance. A
+    strength is multiplied by the first over the second, and by how much less a pose lets them differ than
+    they vary, so that flat ground, which fits anywhere, tells nothing, and steep ground that fits tells most.
+    The power is two at most, since neighbouring heights go together, and less where few cells are compared,
+    of which some agree by luck; ground that is not seen tells nothing.
 
     Attributes:
         least_m: least spread of the ground's height differences of all hypotheses, metres; 0 if unknown.
-        most_told: greatest ratio of what they vary by to what they differ by, both as variances.
-        usual: weight of a hypothesis whose ground is not known: the median of the others.
+        most: what the ground tells at most of any hypothesis.
 
     """
 
     least_m: float = 0.0
-    most_told: float = 1.0
-    usual: float = 1.0
+    most: float = 1.0
 
     @classmethod
     def of(cls, candidates: Sequence[Candidate]) -> GroundWeights:
@@ -151,8 +152,9 @@ class GroundWeights:
         known = [c.ground for c in candidates if c.ground is not None and c.ground.known]
         if not known:
             return cls()
-        weights = cls(min(one.spread_m for one in known), max(_told(one) for one in known))
-        return replace(weights, usual=float(np.median([weights.factor(one) for one in known])))
+        weights = cls(min(one.spread_m for one in known))
+        told = [weights._told(c.ground) for c in candidates]
+        return replace(weights, most=max(told))
 
     def weighed(self, candidate: Candidate) -> float:
         """Return a hypothesis' strength times its weight, which is 1 at most."""
@@ -160,22 +162,20 @@ class GroundWeights:
 
     def factor(self, ground: GroundComparison | None) -> float:
         """Return the weight of a comparison of both grounds, 0 to 1."""
+        return self._told(ground) / self.most
+
+    def _told(self, ground: GroundComparison | None) -> float:
         if ground is None or not ground.known:
-            return self.usual
+            return 1.0
         noise = GROUND_SCALE_M**2
         differ = (noise + self.least_m**2) / (noise + ground.spread_m**2)
-        return float(differ * _told(ground) / self.most_told)
+        less = (noise + ground.relief_m**2) / (noise + ground.spread_m**2)
+        power = ground.cells / (ground.cells + LUCKY * ground.fewest)
+        return float((differ * np.clip(less, 1.0, MOST_TOLD)) ** power)
 
 
 def _known(candidate: Candidate) -> bool:
     return candidate.ground is not None and candidate.ground.known
-
-
-def _told(ground: GroundComparison) -> float:
-    """Return how much more the grounds vary than they differ, as a ratio of variances; 1 if they do not."""
-    noise = GROUND_SCALE_M**2
-    ratio = (noise + ground.relief_m**2) / (noise + ground.spread_m**2)
-    return float(np.clip(ratio, 1.0, MOST_TOLD))
 
 
 def same_pose(a: Pose, b: Pose, apart_m: float, radius_m: float) -> bool:

@@ -167,21 +167,23 @@ def test_grounds_that_disagree_weigh_a_hypothesis_down() -> None:
 
 
 def test_flat_ground_that_fits_tells_less_than_steep_ground_that_fits() -> None:
-    def judged(strength: float, spread_m: float, relief_m: float, cells: int = 100) -> Candidate:
+    def judged(strength: float, spread_m: float, relief_m: float, cells: int = 400) -> Candidate:
         ground = GroundComparison(cells, spread_m, relief_m=relief_m)
         return _Strong(Pose(0.0, strength, 0.0, strength, 100), ground=ground)
 
     steep, flat = judged(10.0, 0.09, 0.6), judged(14.0, 0.06, 0.06)
     far = judged(14.0, 0.6, 0.6)
     hidden = judged(14.0, np.inf, 0.0, cells=0)
-    weights = GroundWeights.of([steep, flat, far, hidden])
-    ranked = sorted([steep, flat, far, hidden], key=weights.weighed, reverse=True)
+    few = judged(10.0, 0.09, 0.6, cells=10)
+    all_of_them = [steep, flat, far, hidden, few]
+    weights = GroundWeights.of(all_of_them)
+    ranked = sorted(all_of_them, key=weights.weighed, reverse=True)
     assert ranked[0] is steep
     assert ranked[-1] is far
-    # ground that is not seen counts as it does in the middle of the others
-    assert weights.factor(hidden.ground) == weights.factor(flat.ground)
+    # few cells agree by luck, and ground that is not seen tells nothing
+    assert weights.factor(hidden.ground) < weights.factor(few.ground) < weights.factor(steep.ground) / 2
     # a strength never exceeds what patches give, and where no ground is seen it is that
-    assert all(0.0 < weights.weighed(one) <= one.strength for one in (steep, flat, far, hidden))
+    assert all(0.0 < weights.weighed(one) <= one.strength for one in all_of_them)
     assert GroundWeights.of([hidden]).weighed(hidden) == hidden.strength
     # on a plain all poses differ by noise, and hardly one is preferred
     plain = [judged(10.0, spread, 0.02) for spread in (0.01, 0.02)]
