@@ -9,7 +9,7 @@ import numpy as np
 
 from mtpcr_geo.core.arrays import Mask
 from mtpcr_geo.core.statistics import chance_within, neg_log10_p
-from mtpcr_geo.match.base import margin_of
+from mtpcr_geo.match.base import LARGEST_MARGIN, margin_of
 from mtpcr_geo.match.patches import PatchMatches
 from mtpcr_geo.match.pose import Pose
 from mtpcr_geo.match.search import angle_between
@@ -80,7 +80,8 @@ class Pool:
 
     Attributes:
         candidates: the hypotheses.
-        strengths: of each: score times support, times how well the ground agrees.
+        strengths: of the best, score times support, times how well the ground agrees; of each other, that
+            over how many times stronger the best one is, see `GroundWeights.ratio`.
         bound: no hypothesis left unjudged is stronger than this.
 
     """
@@ -93,16 +94,20 @@ class Pool:
     def of(cls, candidates: Sequence[Candidate], scales: Scales, bound: float = 0.0) -> Pool:
         """Rank candidates by strength and the ground, and join those that came down to the same place."""
         ground = GroundWeights.of(candidates)
-        ranked = [(ground.weighed(c), c) for c in candidates]
-        ranked.sort(key=lambda one: (-one[0], -one[1].pose.score))
-        kept: list[tuple[float, Candidate]] = []
-        for strength, candidate in ranked:
+        kept: list[Candidate] = []
+        for candidate in sorted(candidates, key=lambda c: (-ground.weighed(c), -c.pose.score)):
             if not any(
                 same_pose(candidate.pose, other.pose, scales.same_pose_m, scales.extent_m / 2)
-                for _, other in kept
+                for other in kept
             ):
-                kept.append((strength, candidate))
-        return cls(tuple(c for _, c in kept), tuple(s for s, _ in kept), bound)
+                kept.append(candidate)
+        if not kept:
+            return cls(bound=bound)
+        best = kept[0]
+        most = ground.weighed(best)
+        others = [(most / max(ground.ratio(best, other), 1.0), other) for other in kept[1:]]
+        others.sort(key=lambda one: -one[0])
+        return cls((best, *(c for _, c in others)), (most, *(s for s, _ in others)), bound)
 
     @property
     def margin(self) -> float:
@@ -115,14 +120,15 @@ class Pool:
         The ground weighs in both alike, held against the best of either: a lattice of rows fits the rows of
         its mirror image as well as its own, but not the terrain beneath.
         """
-        ground = None
+        best = self.candidates[0]
         if all(any(_known(c) for c in pool.candidates) for pool in (self, other)):
             ground = GroundWeights.of([*self.candidates, *other.candidates])
-        best, *rivals = (
-            c.strength if ground is None else ground.weighed(c)
-            for c in (self.candidates[0], *other.candidates)
-        )
-        return margin_of([best, max(rivals, default=0.0)], floor=other.bound)
+        else:
+            ground = GroundWeights(unseen=True)
+        ratio = min((ground.ratio(best, c) for c in other.candidates), default=LARGEST_MARGIN)
+        if other.bound > 0.0:
+            ratio = min(ratio, ground.weighed(best) / other.bound)
+        return ratio
 
 
 @dataclass(frozen=True)
@@ -137,14 +143,20 @@ class GroundWeights:
     The power is two at most, since neighbouring heights go together, and less where few cells are compared,
     of which some agree by luck; ground that is not seen tells nothing.
 
+    How many times stronger the best one is counts the second factor alone, or both if that is less: that
+    others lie on ground unlike the source's speaks against these, not for the best. On the one flat place of
+    a hilly site whatever is flat beats all that was found beside it.
+
     Attributes:
         least_m: least spread of the ground's height differences of all hypotheses, metres; 0 if unknown.
         most: what the ground tells at most of any hypothesis.
+        unseen: whether the ground is left out.
 
     """
 
     least_m: float = 0.0
     most: float = 1.0
+    unseen: bool = False
 
     @classmethod
     def of(cls, candidates: Sequence[Candidate]) -> GroundWeights:
@@ -160,18 +172,38 @@ class GroundWeights:
         """Return a hypothesis' strength times its weight, which is 1 at most."""
         return candidate.strength * self.factor(candidate.ground)
 
+    def ratio(self, best: Candidate, other: Candidate) -> float:
+        """Return how many times stronger one hypothesis is than another, `LARGEST_MARGIN` at most."""
+        if best.strength <= 0.0:
+            return 1.0
+        if other.strength <= 0.0:
+            return LARGEST_MARGIN
+        told = [self._told(one.ground) for one in (best, other)]
+        vouched = [self._vouched(one.ground) for one in (best, other)]
+        ratio = min(told[0] / told[1], vouched[0] / vouched[1]) * best.strength / other.strength
+        return min(ratio, LARGEST_MARGIN)
+
     def factor(self, ground: GroundComparison | None) -> float:
         """Return the weight of a comparison of both grounds, 0 to 1."""
         return self._told(ground) / self.most
 
     def _told(self, ground: GroundComparison | None) -> float:
-        if ground is None or not ground.known:
+        if ground is None or not ground.known or self.unseen:
             return 1.0
         noise = GROUND_SCALE_M**2
         differ = (noise + self.least_m**2) / (noise + ground.spread_m**2)
+        return float(differ ** _power(ground)) * self._vouched(ground)
+
+    def _vouched(self, ground: GroundComparison | None) -> float:
+        if ground is None or not ground.known or self.unseen:
+            return 1.0
+        noise = GROUND_SCALE_M**2
         less = (noise + ground.relief_m**2) / (noise + ground.spread_m**2)
-        power = ground.cells / (ground.cells + LUCKY * ground.fewest)
-        return float((differ * np.clip(less, 1.0, MOST_TOLD)) ** power)
+        return float(np.clip(less, 1.0, MOST_TOLD) ** _power(ground))
+
+
+def _power(ground: GroundComparison) -> float:
+    return ground.cells / (ground.cells + LUCKY * ground.fewest)
 
 
 def _known(candidate: Candidate) -> bool:

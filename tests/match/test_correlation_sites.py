@@ -147,8 +147,8 @@ def test_grounds_that_disagree_weigh_a_hypothesis_down() -> None:
         def strength(self) -> float:
             return self.pose.score
 
-    def judged(score: float, east: float, spread_m: float, cells: int = 50) -> Candidate:
-        return Judged(Pose(0.0, east, 0.0, score), ground=GroundComparison(cells, spread_m))
+    def judged(score: float, east: float, spread_m: float, cells: int = 400) -> Candidate:
+        return Judged(Pose(0.0, east, 0.0, score), ground=GroundComparison(cells, spread_m, relief_m=0.9))
 
     scales = Scales(
         cell_m=1.0, extent_m=40.0, patch_m=12.0, search_radius_m=3.0, least_overlap_m2=300.0,
@@ -239,16 +239,18 @@ def test_tie_points_lie_where_the_best_hypothesis_puts_them() -> None:
 
 
 def test_the_ground_weighs_in_a_pose_and_in_its_mirror_image_alike() -> None:
-    def pool(strength: float, spread: float) -> Pool:
-        candidate = _Strong(Pose(0.0, 0.0, 0.0, strength, 100), ground=GroundComparison(100, spread))
+    def pool(strength: float, spread: float, relief: float = 0.5) -> Pool:
+        ground = GroundComparison(100, spread, relief_m=relief)
+        candidate = _Strong(Pose(0.0, 0.0, 0.0, strength, 100), ground=ground)
         return Pool((candidate,), (strength,))
 
     alike = pool(10.0, 0.02).over(pool(12.0, 0.02))
     assert alike == pytest.approx(10.0 / 12.0)
     assert pool(10.0, 0.02).over(pool(12.0, 0.5)) > 5.0
     assert pool(10.0, 0.5).over(pool(12.0, 0.02)) < 0.2
-    # and of flat ground, which is alike everywhere, nothing is made
-    assert pool(10.0, 0.0).over(pool(12.0, 0.01)) == pytest.approx(alike, rel=0.05)
+    # and of flat ground, which is alike everywhere, nothing is made, whatever others lie on
+    assert pool(10.0, 0.0, 0.01).over(pool(12.0, 0.01, 0.01)) == pytest.approx(alike, rel=0.05)
+    assert pool(10.0, 0.02, 0.02).over(pool(12.0, 2.0, 2.0)) == pytest.approx(alike, rel=0.05)
 
 
 class _Strong(Candidate):
