@@ -224,8 +224,9 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.match neg_log10_p``: significance of that support
 - ``mtpcr.match patches``: patches in the overlap
 - ``mtpcr.match scores``: scores of the hypotheses at the finest cells
-- ``mtpcr.match strengths``: their strengths: score times support, times how well the ground agrees; from
-  keypoints that vote, pairs that agree on each pose, less the two that always do
+- ``mtpcr.match strengths``: their strengths: of the best one, score times support, times how well the ground
+  agrees; of the others, that over how many times stronger it is; from keypoints that vote, pairs that agree
+  on each pose, less the two that always do
 - ``mtpcr.match ground_spread_m``: robust spread of the differences between both grounds' heights under each
   of them; null where too little ground is compared
 - ``mtpcr.match mirrored_strengths``: score times support of the hypotheses of the mirrored source; null where
@@ -233,7 +234,7 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.match self_likeness``: correlation of the scene under the best hypothesis with itself, moved: a
   scene that repeats itself has 0.4 and more
 - ``mtpcr.match by_proposals``: whether the best hypothesis was proposed by the network
-- ``mtpcr.match null_ratio``: score times support of the best hypothesis over the best of these
+- ``mtpcr.match null_ratio``: strength of the best hypothesis over the best of these, the ground weighed
 - ``mtpcr.match verticals[].source``: what the source was levelled by, where several verticals were tried
 - ``mtpcr.match verticals[].target``: the same of the target
 - ``mtpcr.match verticals[].source_tilt_deg``: tilt of the source's vertical there
