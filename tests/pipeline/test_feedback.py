@@ -113,9 +113,21 @@ def test_surfaces_that_slid_away_are_not_borne_out_by_coarser_cells(registered) 
     pair, T = registered
     off, refined = beside(pair, T, (1.6, 0.0, 0.0))
     assert refined.icp is not None
+    assert off.matches is not None
     away = transforms.compose(np.eye(3), np.array([0.0, 6.0, 0.0])) @ T
-    slid = replace(refined, icp=replace(refined.icp, T_surfaces=away))
-    assert matched_coarser(off, slid, RefineSettings(), raster) is None
+    slid = replace(refined, T=away, icp=replace(refined.icp, T_surfaces=away))
+    # what is found anew may lead to a third place, if the same surfaces meet clearly better there
+    again = matched_coarser(off, slid, RefineSettings(), raster)
+    assert again is not None
+    assert again.T_target_source is not None
+    places = transforms.apply(transforms.inverse(T), np.array([[40.0, 40.0, 0.0], [-40.0, -40.0, 0.0]]))
+    apart = transforms.apply(again.T_target_source, places) - transforms.apply(T, places)
+    assert np.abs(apart).max() < 0.03
+    # not if they meet as well already, and not among rows, where a third place is the next row
+    met = replace(refined, T=T, icp=replace(refined.icp, T_surfaces=away))
+    assert matched_coarser(off, met, RefineSettings(), raster) is None
+    rows = off.with_(matches=replace(off.matches, repeats=True))
+    assert matched_coarser(rows, slid, RefineSettings(), raster) is None
 
 
 def test_a_refinement_held_to_wrong_tie_points_is_heard_again(registered) -> None:
