@@ -126,7 +126,7 @@ class Pool:
         else:
             ground = GroundWeights(unseen=True)
         ratio = min((ground.ratio(best, c) for c in other.candidates), default=LARGEST_MARGIN)
-        if other.bound > 0.0:
+        if other.bound > 0.0 and best.strength > 0.0:
             ratio = min(ratio, ground.weighed(best) / other.bound)
         return ratio
 

@@ -187,14 +187,17 @@ def matched_coarser(
 def _meet_better(pair: Pair, before: Floats, after: Floats, settings: RefineSettings) -> bool:
     """Return whether the same surfaces, those of the overlap before, meet clearly better after."""
     distance = max(max(one.max_correspondence_distances_m) for one in rounds_for(pair.cell).values())
-    surfaces = Surfaces(
-        pair.source.sample,
-        pair.target.sample,
-        before,
-        voxel_m=settings.voxel_m,
-        max_correspondence_distance_m=distance,
-        max_points=settings.max_points,
-    )
+    try:
+        surfaces = Surfaces(
+            pair.source.sample,
+            pair.target.sample,
+            before,
+            voxel_m=settings.voxel_m,
+            max_correspondence_distance_m=distance,
+            max_points=settings.max_points,
+        )
+    except RegistrationError:
+        return False  # a second opinion never costs the first
     return surfaces.surface_residual(after) <= BETTER * surfaces.surface_residual(before)
 
 
