@@ -230,8 +230,8 @@ class Matches(ComparesArrays):
             matchers that have none.
         matcher: what found them, so that FOCUS can ask it again.
         before_focus: the matches of the first pass, where FOCUS replaced them.
-        complete: carries on a search that was left off, and returns its matches; it is given what is called
-            with 1 after each yaw searched. None where there is nothing more to do.
+        search_further: carries on a search that was left off, and returns its matches; it is given what is
+            called with 1 after each yaw searched. None where there is nothing more to do.
 
     """
 
@@ -252,7 +252,7 @@ class Matches(ComparesArrays):
     target_keypoints: Floats | None = None
     matcher: Any = None
     before_focus: Matches | None = None
-    complete: Callable[[Callable[[int], object]], Matches] | None = None
+    search_further: Callable[[Callable[[int], object]], Matches] | None = None
 
     def __len__(self) -> int:
         return len(self.score)

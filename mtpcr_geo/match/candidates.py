@@ -22,10 +22,10 @@ AGREE_TOLERANCES = 1.5
 SAME_YAW_DEG = 5.0
 GROUND_SCALE_M = 0.05
 """Spread of the ground's height differences that borders of cells and noise cause, and that says nothing."""
-MOST_TOLD = 16.0
+MOST_BY_RELIEF = 16.0
 """Times at most by which a pose may be likelier for how much less the grounds differ than they vary: beyond
 it neighbouring heights, which go together, would be counted as so many witnesses."""
-LUCKY = 5.0
+CELLS_OF_HALF_POWER = 5.0
 """Times the fewest cells that are ground enough to compare: with these its logarithm counts by half."""
 
 
@@ -165,8 +165,7 @@ class GroundWeights:
         if not known:
             return cls()
         weights = cls(min(one.spread_m for one in known))
-        told = [weights._told(c.ground) for c in candidates]
-        return replace(weights, most=max(told))
+        return replace(weights, most=max(weights.factor(c.ground) for c in candidates))
 
     def weighed(self, candidate: Candidate) -> float:
         """Return a hypothesis' strength times its weight, which is 1 at most."""
@@ -178,32 +177,27 @@ class GroundWeights:
             return 1.0
         if other.strength <= 0.0:
             return LARGEST_MARGIN
-        told = [self._told(one.ground) for one in (best, other)]
-        vouched = [self._vouched(one.ground) for one in (best, other)]
-        ratio = min(told[0] / told[1], vouched[0] / vouched[1]) * best.strength / other.strength
-        return min(ratio, LARGEST_MARGIN)
+        (by_spread, by_relief), (spread_of_other, relief_of_other) = (
+            self._likelihoods(one.ground) for one in (best, other)
+        )
+        both = by_spread * by_relief / (spread_of_other * relief_of_other)
+        return min(min(both, by_relief / relief_of_other) * best.strength / other.strength, LARGEST_MARGIN)
 
     def factor(self, ground: GroundComparison | None) -> float:
         """Return the weight of a comparison of both grounds, 0 to 1."""
-        return self._told(ground) / self.most
+        by_spread, by_relief = self._likelihoods(ground)
+        return by_spread * by_relief / self.most
 
-    def _told(self, ground: GroundComparison | None) -> float:
+    def _likelihoods(self, ground: GroundComparison | None) -> tuple[float, float]:
+        """Return what the spread tells beside the least of all, and what it tells beside the relief."""
         if ground is None or not ground.known or self.unseen:
-            return 1.0
+            return 1.0, 1.0
         noise = GROUND_SCALE_M**2
-        differ = (noise + self.least_m**2) / (noise + ground.spread_m**2)
-        return float(differ ** _power(ground)) * self._vouched(ground)
-
-    def _vouched(self, ground: GroundComparison | None) -> float:
-        if ground is None or not ground.known or self.unseen:
-            return 1.0
-        noise = GROUND_SCALE_M**2
-        less = (noise + ground.relief_m**2) / (noise + ground.spread_m**2)
-        return float(np.clip(less, 1.0, MOST_TOLD) ** _power(ground))
-
-
-def _power(ground: GroundComparison) -> float:
-    return ground.cells / (ground.cells + LUCKY * ground.fewest)
+        differ = noise + ground.spread_m**2
+        power = ground.cells / (ground.cells + CELLS_OF_HALF_POWER * ground.fewest)
+        beside_least = (noise + self.least_m**2) / differ
+        beside_relief = float(np.clip((noise + ground.relief_m**2) / differ, 1.0, MOST_BY_RELIEF))
+        return float(beside_least**power), beside_relief**power
 
 
 def _known(candidate: Candidate) -> bool:

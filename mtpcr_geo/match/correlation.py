@@ -61,9 +61,9 @@ def match(
         seed: of the sampling when patches vote.
         advance: called with 1 after each yaw searched.
         prior: what is known of the pose; None to search everywhere.
-        provisional: of a search that does not settle, leave to `Matches.complete` what is dear and tells
-            nothing of which of several verticals is right: the network's proposals, and the mirrored source
-            where the best pose does not stand out.
+        provisional: of a search that does not settle, leave to `Matches.search_further` what is dear and
+            tells nothing of which of several verticals is right: the network's proposals, and the mirrored
+            source where the best pose does not stand out.
 
     Returns:
         Local matches under the best hypothesis (possibly few), and all hypotheses, best first.
@@ -178,10 +178,10 @@ class _Search:
             mirrored_strengths=None if twin is None else tuple(c.strength for c in twin.pool.candidates),
             repeats=search.repeats(),
             report=self._report(patches.patches, radius, twin, null_ratio),
-            complete=self._completed if left_off else None,
+            search_further=self._further if left_off else None,
         )
 
-    def _completed(self, advance: Callable[[int], object]) -> Matches:
+    def _further(self, advance: Callable[[int], object]) -> Matches:
         for one in (self.found, self.twin):
             if one is not None:
                 one.advance = advance
@@ -228,10 +228,10 @@ def exchanged(matches: Matches) -> Matches:
         east, north = one.shift
         back = (float(-(c * east + s * north)), float(s * east - c * north))
         hypotheses.append(replace(one, yaw=-one.yaw, shift=back))
-    complete = matches.complete
+    further = matches.search_further
     return replace(
         matches,
-        complete=None if complete is None else lambda advance: exchanged(complete(advance)),
+        search_further=None if further is None else lambda advance: exchanged(further(advance)),
         source_px=matches.target_px,
         target_px=matches.source_px,
         hypotheses=tuple(hypotheses),

@@ -59,7 +59,7 @@ class CorrelationMatcher:
     Attributes:
         settings: what governs the search.
         prior: what is known of the pose beforehand.
-        provisional: whether a search that does not settle is left off, see `Matches.complete`.
+        provisional: whether a search that does not settle is left off, see `Matches.search_further`.
 
     """
 

@@ -19,7 +19,8 @@ from mtpcr_geo.method.gicp import Descender, Surface, weighing
 from mtpcr_geo.method.neighbourhoods import local_shapes
 from mtpcr_geo.method.overlap import overlap_of
 
-FEWEST_POINTS = 200
+FEWEST_POINTS = 60
+"""Ten to each of the six parameters."""
 FAR_DISTANCES_M = (3.0, 1.5)
 NEAR_DISTANCES_M = (1.0, 0.5)
 FINE_CELL_M = 2.0

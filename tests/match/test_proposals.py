@@ -101,16 +101,16 @@ def test_a_search_that_is_left_off_and_carried_on_is_the_whole_search(
     left_off = match(
         source, target, CorrelationSettings(min_overlap_share=SHARE, proposals=given[1]), provisional=True
     )
-    assert left_off.complete is not None
+    assert left_off.search_further is not None
     assert given[1].asked == 0
     # nothing is said of chance where the mirrored source was not searched
     assert left_off.null_ratio is None
     assert left_off.margin is not None
     assert left_off.margin < 1.5
-    done = left_off.complete(yaws.append)
+    done = left_off.search_further(yaws.append)
     assert yaws
     assert given[0].asked == given[1].asked
-    assert done.complete is None
+    assert done.search_further is None
     assert done.hypotheses == whole.hypotheses
     assert (done.margin, done.null_ratio, done.report) == (whole.margin, whole.null_ratio, whole.report)
     assert np.array_equal(done.source_px, whole.source_px)
@@ -121,7 +121,7 @@ def test_a_search_that_settles_is_not_left_off() -> None:
     rng = np.random.default_rng(1)
     source, target = bev_of(plot(rng), 0.25), bev_of(plot(rng), 0.25)
     found, whole = (match(source, target, provisional=one) for one in (True, False))
-    assert found.complete is None
+    assert found.search_further is None
     assert found.null_ratio == whole.null_ratio is not None
 
 

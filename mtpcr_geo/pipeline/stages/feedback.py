@@ -98,22 +98,14 @@ def fed_back(
     again = pair.with_(source=replace(side, bev=rasterise(side, source.grid.cell)), refinement=None)
     try:
         again = _solved(again, pair)
+        found = again.matches
+        assert found is not None
+        strength, before = found.strength or 0.0, matches.strength or 0.0
+        if strength < WEAKEST * before:
+            return None
+        refinement = _refined(again, settings)
     except RegistrationError:
-        return None
-    found = again.matches
-    assert found is not None
-    assert again.T_target_source is not None
-    strength, before = found.strength or 0.0, matches.strength or 0.0
-    if strength < WEAKEST * before:
-        return None
-    refinement = refine(
-        again.source.sample,
-        again.target.sample,
-        again.T_target_source,
-        settings,
-        cell=again.cell,
-        agreeing=lambda T: tie_points_agreeing(again, T),
-    )
+        return None  # a second search never costs the first
     if strength < before and not borne_out(refined, refinement):
         return None
     why = "levelled, matched and solved again by the vertical that ICP had found"
@@ -155,25 +147,18 @@ def matched_coarser(
     again = pair.with_(source=sides[0], target=sides[1], refinement=None)
     try:
         again = _solved(again, pair)
+        assert again.matches is not None
+        if cell * (again.matches.strength or 0.0) <= pair.cell * (matches.strength or 0.0):
+            return None  # in metres the strength is the same at any cell that is filled well
+        anew = again.T_target_source
+        assert pair.T_target_source is not None
+        assert anew is not None
+        beside = _apart_m(pair, anew, icp.T_surfaces) >= _apart_m(pair, anew, pair.T_target_source)
+        if beside and not icp.contested:
+            return None  # along rows both are near, and the nearer counts
+        refinement = _refined(again, settings)
     except RegistrationError:
-        return None
-    assert again.matches is not None
-    if cell * (again.matches.strength or 0.0) <= pair.cell * (matches.strength or 0.0):
-        return None  # in metres the strength is the same at any cell that is filled well
-    assert pair.T_target_source is not None
-    assert again.T_target_source is not None
-    anew = again.T_target_source
-    beside = _apart_m(pair, anew, icp.T_surfaces) >= _apart_m(pair, anew, pair.T_target_source)
-    if beside and not icp.contested:
-        return None  # along rows both are near, and the nearer counts
-    refinement = refine(
-        again.source.sample,
-        again.target.sample,
-        anew,
-        settings,
-        cell=again.cell,
-        agreeing=lambda T: tie_points_agreeing(again, T),
-    )
+        return None  # a second search never costs the first
     met = refinement.icp
     if met is None or not met.followed or met.contested:
         return None
@@ -218,6 +203,24 @@ def borne_out(before: Refinement, after: Refinement) -> bool:
         return False
     first, last = (one.tried[one.chosen].surface_residual for one in (before.icp, after.icp))
     return after.icp.followed and not after.icp.lost_tie_points and last <= CLOSER * first
+
+
+def _refined(pair: Pair, settings: RefineSettings) -> Refinement:
+    """Refine a solved pair.
+
+    Raises:
+        RegistrationError: if too little of the clouds is brought together.
+
+    """
+    assert pair.T_target_source is not None
+    return refine(
+        pair.source.sample,
+        pair.target.sample,
+        pair.T_target_source,
+        settings,
+        cell=pair.cell,
+        agreeing=lambda T: tie_points_agreeing(pair, T),
+    )
 
 
 def _solved(again: Pair, before: Pair) -> Pair:

@@ -194,10 +194,10 @@ class Match(Stage):
         )
         matches = pair.matches
         assert matches is not None
-        if matches.complete is not None:
+        if matches.search_further is not None:
             # once, under the verticals that were found likeliest
             with context.progress.task("searching on") as advance:
-                matches = replace(matches.complete(advance), matcher=matches.matcher)
+                matches = replace(matches.search_further(advance), matcher=matches.matcher)
         self.metadata |= {"matches": len(matches.score), **matches.report}
         if tried:
             self.metadata["verticals"] = tried
