@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pydantic import Field
@@ -41,7 +41,7 @@ def benchmark(
         list[str] | None,
         typer.Option(
             help="Run suites of the robustness benchmark instead, such as 'pairs discs', or all; --data is "
-            "then the folder of real pairs."
+            "then the folder of real pairs, and --methods takes mtpcr-geo with options only."
         ),
     ] = None,
     calibrate: Annotated[
@@ -119,6 +119,7 @@ def benchmark(
             seed=seed,
             only=tuple(only or ()),
             shift_m=shift,
+            register=_options_of_register(methods),
         )
         _robustness(
             [word for text in robustness for word in text.split()], chosen, out, jobs, time_limit, quiet
@@ -170,6 +171,18 @@ def _scale(sizes: str, data: list[Path], only: tuple[str, ...], out: Path, threa
                 f"processors  {row['peak_mib'] or 0:6.0f} MiB  {row['job']}"
             )
         typer.echo(f"Tables and plot: {out}")
+
+
+def _options_of_register(methods: list[str]) -> tuple[tuple[str, Any], ...]:
+    """Return the options of the method mtpcr-geo, which the robustness benchmark runs alone."""
+    from mtpcr_geo.benchmark.methods import options_of
+    from mtpcr_geo.registration import read_options
+
+    if len(methods) != 1 or methods[0].partition(":")[0] != "mtpcr-geo":
+        raise OptionError("--robustness takes one method, mtpcr-geo, with or without options")
+    options = options_of(methods[0])
+    read_options(options)
+    return tuple(options.items())
 
 
 def _robustness(

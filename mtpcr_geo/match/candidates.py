@@ -22,9 +22,9 @@ AGREE_TOLERANCES = 1.5
 SAME_YAW_DEG = 5.0
 GROUND_SCALE_M = 0.05
 """Spread of the ground's height differences that borders of cells and noise cause, and that says nothing."""
-MOST_BY_RELIEF = 16.0
-"""Times at most by which a pose may be likelier for how much less the grounds differ than they vary: beyond
-it neighbouring heights, which go together, would be counted as so many witnesses."""
+MOST_BY_RELIEF = 400.0
+"""Times at most by which a pose may be likelier for how much less the grounds differ than they vary: a
+twentieth of the relief is left then."""
 CELLS_OF_HALF_POWER = 5.0
 """Times the fewest cells that are ground enough to compare: with these its logarithm counts by half."""
 
@@ -140,6 +140,7 @@ class GroundWeights:
     Of Gaussian heights with n independent places the likelihood of either is a power of the variance. A
     strength is multiplied by the first over the second, and by how much less a pose lets them differ than
     they vary, so that flat ground, which fits anywhere, tells nothing, and steep ground that fits tells most.
+    A slope that lies on a slope is one coincidence, and half of what they vary by counts beyond their planes.
     The power is two at most, since neighbouring heights go together, and less where few cells are compared,
     of which some agree by luck; ground that is not seen tells nothing.
 
@@ -196,7 +197,8 @@ class GroundWeights:
         differ = noise + ground.spread_m**2
         power = ground.cells / (ground.cells + CELLS_OF_HALF_POWER * ground.fewest)
         beside_least = (noise + self.least_m**2) / differ
-        beside_relief = float(np.clip((noise + ground.relief_m**2) / differ, 1.0, MOST_BY_RELIEF))
+        relief = np.sqrt((noise + ground.relief_m**2) * (noise + ground.beyond_plane_m**2))
+        beside_relief = float(np.clip(relief / differ, 1.0, MOST_BY_RELIEF))
         return float(beside_least**power), beside_relief**power
 
 

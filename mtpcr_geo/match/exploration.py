@@ -42,6 +42,8 @@ spread them so, and so does another row of the same houses."""
 PROMISING_NEG_LOG10_P, CONVINCING_NULL_RATIO = 4.0, 2.0
 """Significance from which the mirrored source is asked before finer levels are searched, and the strength
 over it that ends the search: wrong poses have reached 1.5."""
+LEAST_BY_ITSELF = 0.5
+"""Share of the greatest strength, the ground left out, with which the best hypothesis may end the search."""
 CLEAR_LEAD = 3.0
 """Strength over the next distinct pose, and over the mirrored source's best, that ends the search of a scene
 that does not repeat itself before the terrain is asked."""
@@ -324,6 +326,14 @@ class Exploration:
         """
         return self.convinces() and (self.asked_terrain or not self.repeats())
 
+    def matches_by_itself(self) -> bool:
+        """Return whether the best hypothesis is among the strongest before the ground is asked.
+
+        What wins by the ground alone may be beaten by one that nothing has proposed yet.
+        """
+        most = max((candidate.strength for candidate in self.judged), default=0.0)
+        return bool(self.pool.candidates) and self.pool.candidates[0].strength >= LEAST_BY_ITSELF * most
+
     @property
     def asked_terrain(self) -> bool:
         """Whether the terrain has proposed."""
@@ -331,7 +341,7 @@ class Exploration:
 
     def convinces(self) -> bool:
         """Return whether the best hypothesis is beyond doubt by itself."""
-        if not self.pool.candidates or self.pool.margin < self.settings.convincing_margin:
+        if not self.matches_by_itself() or self.pool.margin < self.settings.convincing_margin:
             return False
         best = self.pool.candidates[0]
         if best.ground is not None and best.ground.known and best.ground.spread_m > CONVINCING_SPREAD_M:
@@ -347,7 +357,7 @@ class Exploration:
     def promises(self) -> bool:
         """Return whether the best hypothesis stands out, so that the mirrored source may tell what by."""
         return (
-            bool(self.pool.candidates)
+            self.matches_by_itself()
             and self.pool.margin >= self.settings.convincing_margin
             and self.pool.candidates[0].neg_log10_p >= PROMISING_NEG_LOG10_P
         )

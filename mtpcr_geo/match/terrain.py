@@ -31,6 +31,8 @@ LEAST_SEEN, LEAST_PART = 0.1, 0.2
 that must show in them; and the part of the fewest cells' area that they must show under a pose."""
 MOST_CELLS = 10_000
 """Cells of the source that are compared at most: every so many-th of more."""
+CELLS_OF_PLANE = 1_000
+"""Of these, how many tell how each ground varies beside its own plane."""
 SETTLING_STEPS, STILL_CELLS = 15, 0.002
 KNOWN = 0.99
 """Weight of filled cells above which an interpolated height is one of the ground alone."""
@@ -71,6 +73,7 @@ class GroundComparison:
         fewest: cells that are ground enough to compare.
         relief_m: what that would be if neither ground told anything of the other: their own spreads in the
             cells compared, added in squares.
+        beyond_plane_m: the same of what is left of each ground beside its own plane.
 
     """
 
@@ -78,6 +81,7 @@ class GroundComparison:
     spread_m: float
     fewest: int = FEWEST_CELLS
     relief_m: float = 0.0
+    beyond_plane_m: float = 0.0
 
     @property
     def known(self) -> bool:
@@ -153,25 +157,33 @@ def compare_ground(
         return GroundComparison(cells, np.inf, fewest)
     height = cv2.remap(target.low, x, y, cv2.INTER_LINEAR)[:, 0]
     heights = [one[known].astype(np.float64) for one in (source.low[row, column], height)]
-    level = placed[known] if plane and cells >= 3 * FEWEST_CELLS else None
-    spread, own, other = (_spread_about(level, one) for one in (heights[1] - heights[0], *heights))
-    return GroundComparison(cells, spread, fewest, float(np.hypot(own, other)))
+    places, step = placed[known], heights[1] - heights[0]
+    some = slice(None, None, max(1, cells // CELLS_OF_PLANE))
+    own, other = (_spread(_without_plane(places[some], one[some])) for one in heights)
+    beyond_plane = float(np.hypot(own, other))
+    if plane and cells >= 3 * FEWEST_CELLS:
+        return GroundComparison(
+            cells, _spread(_without_plane(places, step)), fewest, beyond_plane, beyond_plane
+        )
+    own, other = (_spread(one) for one in heights)
+    return GroundComparison(cells, _spread(step), fewest, float(np.hypot(own, other)), beyond_plane)
 
 
-def _spread_about(xy: Floats | None, height: Floats) -> float:
-    """Return the robust spread of (n,) heights about their median, or about a plane over (n, 2) places."""
-    rest = height if xy is None else _without_plane(xy, height)
-    return 1.4826 * float(np.median(np.abs(rest - np.median(rest))))
+def _spread(height: Floats) -> float:
+    """Return the robust spread of (n,) heights about their median."""
+    return 1.4826 * float(np.median(np.abs(height - np.median(height))))
 
 
 def _without_plane(xy: Floats, step: Floats) -> Floats:
     """Take the best plane from (n,) height differences at (n, 2) places, outliers weighed down."""
-    A = np.column_stack([np.ones(len(xy)), xy - xy.mean(axis=0)])
+    centred = xy - xy.mean(axis=0)
+    # of a length of one, so that the normal equations stay well conditioned
+    A = np.column_stack([np.ones(len(xy)), centred / max(float(np.abs(centred).max()), 1e-9)])
     weight = np.ones(len(xy))
     rest = step
     for _ in range(4):
-        x = np.linalg.lstsq(A * weight[:, None], step * weight, rcond=None)[0]
-        rest = step - A @ x
+        W = A * weight[:, None] ** 2
+        rest = step - A @ np.linalg.lstsq(W.T @ A, W.T @ step, rcond=None)[0]
         scale = max(1.4826 * float(np.median(np.abs(rest))), NOISE_M)
         weight = 1.0 / (1.0 + (rest / (2.0 * scale)) ** 2)
     return np.asarray(rest)

@@ -359,6 +359,14 @@ class MethodOptions(PriorOptions):
     enhance: Annotated[
         bool, Field(description="sharpen the images (Eq. 4; profile paper)"), Shown(MATCHING)
     ] = True
+    proposals: Annotated[
+        bool,
+        Field(
+            description="where neither heights nor terrain settle the search, let the network of the matcher "
+            "bev propose further poses (matcher correlation)"
+        ),
+        Shown(MATCHING),
+    ] = True
     seed: Seed = 0
 
 

@@ -417,3 +417,25 @@ def test_command_runs_suites_and_writes_their_sums(data, tmp_path):
     assert [one["suite"] for one in rows] == ["pairs", "swap"]
     assert "## Both ways" in (out / "robustness.md").read_text() or rows[1]["swap_mm"] is None
     assert {path.name for path in Path(out).iterdir()} == {"robustness.csv", "robustness.md"}
+
+
+def test_suites_run_with_options_of_register(data, tmp_path):
+    out = tmp_path / "out"
+    command = ["benchmark", "--robustness", "pairs", "--data", str(data), "--out", str(out), "--starts", "1"]
+    chosen = ["--only", "town0", "-m", "mtpcr-geo:cell=2,proposals=no"]
+    done = CliRunner().invoke(app, [*command, *chosen])
+    assert done.exit_code == 0, done.output
+    (one,) = read_rows(out / "robustness.csv")
+    assert one["case"].endswith("start0/cell=2/proposals=False")
+    assert one["metrics"]["cell_m"] == 2.0
+
+
+@pytest.mark.parametrize(
+    ("method", "says"),
+    [("icp", "takes one method, mtpcr-geo"), ("mtpcr-geo:cel=2", "no option 'cel'; did you mean 'cell'?")],
+)
+def test_suites_run_no_other_method(method, says, data, tmp_path):
+    command = ["benchmark", "--robustness", "pairs", "--data", str(data), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, [*command, "-m", method])
+    assert isinstance(done.exception, OptionError)
+    assert says in str(done.exception)

@@ -153,7 +153,8 @@ def test_every_option_reaches_register(monkeypatch):
         "near_crs": "EPSG:4326", "within": 40.0, "yaw": -30.0, "yaw_tolerance": 8.0,
         "motion": "yaw", "profile": "paper", "matcher": "orb", "models": "folder",
         "source_text": "x y z separator=; skip=2", "target_text": "x - y z", "scale": 0.01, "also": "ply",
-        "res": False, "focus": False, "enhance": False, "seed": 4, "recording": False, "recording_mb": 2.5,
+        "res": False, "focus": False, "enhance": False, "seed": 4,
+        "proposals": False, "recording": False, "recording_mb": 2.5,
         "force": True, "overwrite": True, "threads": 3,
     }  # fmt: skip
     # with a whole pose there is neither place nor yaw

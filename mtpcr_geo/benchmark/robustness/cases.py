@@ -104,6 +104,7 @@ class Case:
         place: number of the disc's place, or the target's site where that is another; "" else.
         asked_overlap: share of the source that shall be shared, where the recipe takes one.
         both_ways: register source and target exchanged too.
+        options: of `register`, beside those of the suite, as names and values.
 
     """
 
@@ -120,6 +121,7 @@ class Case:
     place: str = ""
     asked_overlap: float | None = None
     both_ways: bool = False
+    options: tuple[tuple[str, Any], ...] = ()
 
     @property
     def name(self) -> str:
@@ -127,7 +129,12 @@ class Case:
         parts = [self.suite, self.site, self.kind, self.place]
         parts += [f"{self.radius:g}m"] if self.radius is not None else []
         parts += [f"{100 * self.asked_overlap:g}%"] if self.asked_overlap is not None else []
-        return "/".join(filter(None, [*parts, f"seed{self.seed}", f"start{self.start}"]))
+        parts += [
+            f"seed{self.seed}",
+            f"start{self.start}",
+            *(f"{key}={value}" for key, value in self.options),
+        ]
+        return "/".join(filter(None, parts))
 
     @property
     def batch(self) -> tuple[str, str]:
@@ -153,6 +160,7 @@ class Case:
         options: dict[str, Any] = {"level": self.level, "recording": False}
         if self._keeps_crs(made):
             options |= {"source_crs": "local", "target_crs": made.target_crs}
+        options |= dict(self.options)
         return CaseClouds(
             source=transforms.apply(T_start, made.source),
             target=transforms.apply(T_target_true, made.target),

@@ -138,6 +138,8 @@ def _match_options(options: MethodOptions, matcher: str) -> MatchOptions:
     models = None if matcher == "correlation" else options.models
     # what is not given stays so, as in pipelines written by hand
     known = {name: getattr(options, name) for name in PriorOptions.model_fields}
+    if not options.proposals:
+        known["proposals"] = False
     tried = options.level == "auto"
     return MatchOptions(method=matcher, models=models, verticals=tried, seed=options.seed, **known)
 
@@ -150,6 +152,8 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
         )
     seed = options.seed
     matcher = options.matcher or "bev"
+    if not options.proposals:
+        raise OptionError("--no-proposals belongs to --matcher correlation, which is not of the paper")
     match = MatchOptions(method=matcher, models=options.models, seed=seed)
     # weights trained on height images see nothing in others, and want one cell for both clouds; any other
     # matcher gets the paper's image (Eq. 3 and 4) and cells (Eq. 1)
