@@ -43,7 +43,8 @@ PROMISING_NEG_LOG10_P, CONVINCING_NULL_RATIO = 4.0, 2.0
 """Significance from which the mirrored source is asked before finer levels are searched, and the strength
 over it that ends the search: wrong poses have reached 1.5."""
 LEAST_BY_ITSELF = 0.5
-"""Share of the greatest strength, the ground left out, with which the best hypothesis may end the search."""
+"""Share of the greatest strength, the ground left out, with which the best hypothesis may end the search; and
+share of its patches that agree where the scene repeats itself."""
 CLEAR_LEAD = 3.0
 """Strength over the next distinct pose, and over the mirrored source's best, that ends the search of a scene
 that does not repeat itself before the terrain is asked."""
@@ -329,10 +330,15 @@ class Exploration:
     def matches_by_itself(self) -> bool:
         """Return whether the best hypothesis is among the strongest before the ground is asked.
 
-        What wins by the ground alone may be beaten by one that nothing has proposed yet.
+        What wins by the ground alone may be beaten by one that nothing has proposed yet; so may, where the
+        scene repeats itself, one under which most patches disagree.
         """
-        most = max((candidate.strength for candidate in self.judged), default=0.0)
-        return bool(self.pool.candidates) and self.pool.candidates[0].strength >= LEAST_BY_ITSELF * most
+        if not self.pool.candidates:
+            return False
+        best, most = self.pool.candidates[0], max(candidate.strength for candidate in self.judged)
+        if best.strength < LEAST_BY_ITSELF * most:
+            return False
+        return best.support >= LEAST_BY_ITSELF or not self.repeats()
 
     @property
     def asked_terrain(self) -> bool:

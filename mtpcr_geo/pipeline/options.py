@@ -102,6 +102,15 @@ MatcherName = Annotated[
         "by its name (mtpcr-geo models lists them)"
     ),
 ]
+Proposals = Annotated[
+    bool,
+    Field(
+        description="where neither heights nor terrain settle the search of the matcher correlation: let the "
+        "network of the matcher bev propose further poses, which are judged like all others"
+    ),
+    Shown(MATCHING),
+]
+
 Models = Annotated[
     Path | None,
     Field(description="folder of model files; the environment variable MTPCR_GEO_MODELS if not given"),
@@ -359,14 +368,7 @@ class MethodOptions(PriorOptions):
     enhance: Annotated[
         bool, Field(description="sharpen the images (Eq. 4; profile paper)"), Shown(MATCHING)
     ] = True
-    proposals: Annotated[
-        bool,
-        Field(
-            description="where neither heights nor terrain settle the search, let the network of the matcher "
-            "bev propose further poses (matcher correlation)"
-        ),
-        Shown(MATCHING),
-    ] = True
+    proposals: Proposals = True
     seed: Seed = 0
 
 

@@ -148,7 +148,7 @@ def test_grounds_that_disagree_weigh_a_hypothesis_down() -> None:
             return self.pose.score
 
     def judged(score: float, east: float, spread_m: float, cells: int = 400) -> Candidate:
-        return Judged(Pose(0.0, east, 0.0, score), ground=GroundComparison(cells, spread_m, relief_m=0.9))
+        return Judged(Pose(0.0, east, 0.0, score), ground=GroundComparison(cells, spread_m, 8, 0.9, 0.9))
 
     scales = Scales(
         cell_m=1.0, extent_m=40.0, patch_m=12.0, search_radius_m=3.0, least_overlap_m2=300.0,
@@ -168,7 +168,7 @@ def test_grounds_that_disagree_weigh_a_hypothesis_down() -> None:
 
 def test_flat_ground_that_fits_tells_less_than_steep_ground_that_fits() -> None:
     def judged(strength: float, spread_m: float, relief_m: float, cells: int = 400) -> Candidate:
-        ground = GroundComparison(cells, spread_m, relief_m=relief_m)
+        ground = GroundComparison(cells, spread_m, 8, relief_m, relief_m)
         return _Strong(Pose(0.0, strength, 0.0, strength, 100), ground=ground)
 
     steep, flat = judged(10.0, 0.09, 0.6), judged(14.0, 0.06, 0.06)
@@ -240,7 +240,7 @@ def test_tie_points_lie_where_the_best_hypothesis_puts_them() -> None:
 
 def test_the_ground_weighs_in_a_pose_and_in_its_mirror_image_alike() -> None:
     def pool(strength: float, spread: float, relief: float = 0.5) -> Pool:
-        ground = GroundComparison(100, spread, relief_m=relief)
+        ground = GroundComparison(100, spread, 8, relief, relief)
         candidate = _Strong(Pose(0.0, 0.0, 0.0, strength, 100), ground=ground)
         return Pool((candidate,), (strength,))
 
@@ -251,6 +251,19 @@ def test_the_ground_weighs_in_a_pose_and_in_its_mirror_image_alike() -> None:
     # and of flat ground, which is alike everywhere, nothing is made, whatever others lie on
     assert pool(10.0, 0.0, 0.01).over(pool(12.0, 0.01, 0.01)) == pytest.approx(alike, rel=0.05)
     assert pool(10.0, 0.02, 0.02).over(pool(12.0, 2.0, 2.0)) == pytest.approx(alike, rel=0.05)
+
+
+def test_a_slope_on_a_slope_tells_less_than_a_shape_that_fits() -> None:
+    def judged(beyond_plane_m: float) -> Candidate:
+        ground = GroundComparison(400, 0.09, 8, 0.9, beyond_plane_m)
+        return _Strong(Pose(0.0, beyond_plane_m, 0.0, 10.0, 100), ground=ground)
+
+    shaped, slope = judged(0.9), judged(0.09)
+    weights = GroundWeights.of([shaped, slope])
+    assert weights.ratio(shaped, slope) > 5.0
+    # still more than ground that fits no better than anywhere
+    flat = _Strong(Pose(0.0, 0.0, 0.0, 10.0, 100), ground=GroundComparison(400, 0.09, 8, 0.09, 0.09))
+    assert weights.ratio(slope, flat) > 2.0
 
 
 class _Strong(Candidate):
