@@ -224,6 +224,24 @@ def test_the_best_is_judged_at_the_finest_cells_though_a_first_look_was_enough_f
     )
 
 
+def test_a_pose_that_wins_by_the_ground_alone_ends_no_search() -> None:
+    rng = np.random.default_rng(6)
+    source, target = bev_of(town(rng, 30_000), 1.0), bev_of(town(rng, 30_000), 1.0)
+    search = Exploration(
+        source, target, scales_of(source, target), CorrelationSettings(), 0, lambda n: None,
+    )  # fmt: skip
+    assert not search.matches_by_itself()
+    fits, differs = GroundComparison(400, 0.05, 8, 0.9, 0.9), GroundComparison(400, 0.9, 8, 0.9, 0.9)
+    for strength, among_the_strongest in ((10.0, False), (60.0, True)):
+        search.judged = [
+            _Strong(Pose(0.0, 0.0, 0.0, strength, 100), ground=fits),
+            _Strong(Pose(0.0, 90.0, 0.0, 100.0, 100), ground=differs),
+        ]
+        search._rank()
+        assert search.pool.candidates[0] is search.judged[0]
+        assert search.matches_by_itself() == among_the_strongest
+
+
 def test_tie_points_lie_where_the_best_hypothesis_puts_them() -> None:
     rng = np.random.default_rng(2)
     source = bev_of(planting(rng, (16.0, -40.0), (86.0, 40.0)), 1.0)
