@@ -20,6 +20,13 @@ if TYPE_CHECKING:
     from mtpcr_geo.benchmark.robustness.suites import SuiteOptions
 
 
+_OF_THE_SUITE = {
+    "level", "local", "recording", "recording_mb", "prior", "near", "near_crs", "within", "yaw", "force",
+    "overwrite", "also", "scale",
+}  # fmt: skip
+"""Options of register that the suites set, or that their runs have no use for."""
+
+
 def benchmark(
     out: Annotated[
         Path,
@@ -41,7 +48,7 @@ def benchmark(
         list[str] | None,
         typer.Option(
             help="Run suites of the robustness benchmark instead, such as 'pairs discs', or all; --data is "
-            "then the folder of real pairs, and --methods takes mtpcr-geo with options only."
+            "then the folder of real pairs, and --methods takes mtpcr-geo alone, with or without options."
         ),
     ] = None,
     calibrate: Annotated[
@@ -119,7 +126,7 @@ def benchmark(
             seed=seed,
             only=tuple(only or ()),
             shift_m=shift,
-            register=_options_of_register(methods),
+            register_options=_options_of_register(methods),
         )
         _robustness(
             [word for text in robustness for word in text.split()], chosen, out, jobs, time_limit, quiet
@@ -175,14 +182,21 @@ def _scale(sizes: str, data: list[Path], only: tuple[str, ...], out: Path, threa
 
 def _options_of_register(methods: list[str]) -> tuple[tuple[str, Any], ...]:
     """Return the options of the method mtpcr-geo, which the robustness benchmark runs alone."""
-    from mtpcr_geo.benchmark.methods import options_of
+    from mtpcr_geo.benchmark.methods import make_method, options_of
     from mtpcr_geo.registration import read_options
 
-    if len(methods) != 1 or methods[0].partition(":")[0] != "mtpcr-geo":
+    words = [word for text in methods for word in text.split()]
+    if len(words) != 1 or words[0].partition(":")[0] != "mtpcr-geo":
         raise OptionError("--robustness takes one method, mtpcr-geo, with or without options")
-    options = options_of(methods[0])
-    read_options(options)
-    return tuple(options.items())
+    given = options_of(words[0])
+    chosen = read_options(given)
+    for name in given:
+        if name in _OF_THE_SUITE or name.startswith(("source_", "target_")):
+            raise OptionError(f"the suites of --robustness set {name!r} themselves; leave it out")
+    make_method(words[0])
+    # one spelling for one run: its name tells it from others
+    kept = chosen.model_dump(mode="json", exclude_defaults=True)
+    return tuple(sorted(kept.items()))
 
 
 def _robustness(

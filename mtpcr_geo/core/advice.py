@@ -31,7 +31,7 @@ _WORDS = {
     "profile": "default|paper",
     "motion": "rigid|yaw|translation",
     "also": r"input|ply|pcd|xyz|csv|npy|e57|las|copc\.laz",
-    "matcher": "bev|rootsift|orb|xfeat|superpoint",
+    "matcher": "correlation|bev|rootsift|orb|xfeat|superpoint",
     "prior": "georef",
 }
 """Values that an option takes, by the end of its name; behind another they are words of the sentence."""

@@ -25,8 +25,12 @@ GROUND_SCALE_M = 0.05
 MOST_BY_RELIEF = 400.0
 """Times at most by which a pose may be likelier for how much less the grounds differ than they vary: a
 twentieth of the relief is left then."""
-CELLS_OF_HALF_POWER = 5.0
+HALF_POWER_TIMES_FEWEST = 5.0
 """Times the fewest cells that are ground enough to compare: with these its logarithm counts by half."""
+
+
+LEAST_BY_ITSELF = 0.5
+"""Share of the greatest strength, the ground left out, with which the best hypothesis may end a search."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +118,11 @@ class Pool:
         """Strength of the best over that of the next distinct hypothesis, at least."""
         return margin_of(self.strengths, floor=self.bound)
 
+    def by_itself(self, judged: Sequence[Candidate]) -> bool:
+        """Return whether the best hypothesis is among the strongest that were judged, the ground left out."""
+        most = max((candidate.strength for candidate in judged), default=0.0)
+        return bool(self.candidates) and self.candidates[0].strength >= LEAST_BY_ITSELF * most
+
     def over(self, other: Pool) -> float:
         """Return the strength of the best over the greatest of another pool, at least.
 
@@ -140,9 +149,10 @@ class GroundWeights:
     Of Gaussian heights with n independent places the likelihood of either is a power of the variance. A
     strength is multiplied by the first over the second, and by how much less a pose lets them differ than
     they vary, so that flat ground, which fits anywhere, tells nothing, and steep ground that fits tells most.
-    A slope that lies on a slope is one coincidence, and half of what they vary by counts beyond their planes.
-    The power is two at most, since neighbouring heights go together, and less where few cells are compared,
-    of which some agree by luck; ground that is not seen tells nothing.
+    A slope that lies on a slope is one coincidence: what they vary by is the geometric mean of that and of
+    what is left beside their own planes. The power of a variance is one at most, since neighbouring heights
+    go together, and less where few cells are compared, of which some agree by luck; ground that is not seen
+    tells nothing.
 
     How many times stronger the best one is counts the second factor alone, or both if that is less: that
     others lie on ground unlike the source's speaks against these, not for the best. On the one flat place of
@@ -195,7 +205,7 @@ class GroundWeights:
             return 1.0, 1.0
         noise = GROUND_SCALE_M**2
         differ = noise + ground.spread_m**2
-        power = ground.cells / (ground.cells + CELLS_OF_HALF_POWER * ground.fewest)
+        power = ground.cells / (ground.cells + HALF_POWER_TIMES_FEWEST * ground.fewest)
         beside_least = (noise + self.least_m**2) / differ
         relief = np.sqrt((noise + ground.relief_m**2) * (noise + ground.beyond_plane_m**2))
         beside_relief = float(np.clip(relief / differ, 1.0, MOST_BY_RELIEF))

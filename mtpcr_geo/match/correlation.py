@@ -207,10 +207,13 @@ class _Search:
             "patches": patches,
             "scores": [round(c.pose.score, 3) for c in pool.candidates],
             "strengths": [round(strength, 3) for strength in pool.strengths],
-            "ground_spread_m": [
-                round(c.ground.spread_m, 3) if c.ground is not None and c.ground.known else None
-                for c in pool.candidates
-            ],
+            **{
+                f"ground_{name}": [
+                    round(getattr(c.ground, name), 3) if c.ground is not None and c.ground.known else None
+                    for c in pool.candidates
+                ]
+                for name in ("spread_m", "relief_m", "beyond_plane_m")
+            },
             "mirrored_strengths": None
             if twin is None
             else [round(c.strength, 3) for c in twin.pool.candidates],

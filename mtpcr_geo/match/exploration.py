@@ -42,9 +42,9 @@ spread them so, and so does another row of the same houses."""
 PROMISING_NEG_LOG10_P, CONVINCING_NULL_RATIO = 4.0, 2.0
 """Significance from which the mirrored source is asked before finer levels are searched, and the strength
 over it that ends the search: wrong poses have reached 1.5."""
-LEAST_BY_ITSELF = 0.5
-"""Share of the greatest strength, the ground left out, with which the best hypothesis may end the search; and
-share of its patches that agree where the scene repeats itself."""
+LEAST_SUPPORT_OF_ROWS = 0.5
+"""Share of its patches that agree with which the best hypothesis may end the search of a scene that repeats
+itself."""
 CLEAR_LEAD = 3.0
 """Strength over the next distinct pose, and over the mirrored source's best, that ends the search of a scene
 that does not repeat itself before the terrain is asked."""
@@ -327,18 +327,15 @@ class Exploration:
         """
         return self.convinces() and (self.asked_terrain or not self.repeats())
 
-    def matches_by_itself(self) -> bool:
-        """Return whether the best hypothesis is among the strongest before the ground is asked.
+    def may_end_search(self) -> bool:
+        """Return whether the best hypothesis may end the search.
 
         What wins by the ground alone may be beaten by one that nothing has proposed yet; so may, where the
         scene repeats itself, one under which most patches disagree.
         """
-        if not self.pool.candidates:
+        if not self.pool.by_itself(self.judged):
             return False
-        best, most = self.pool.candidates[0], max(candidate.strength for candidate in self.judged)
-        if best.strength < LEAST_BY_ITSELF * most:
-            return False
-        return best.support >= LEAST_BY_ITSELF or not self.repeats()
+        return self.pool.candidates[0].support >= LEAST_SUPPORT_OF_ROWS or not self.repeats()
 
     @property
     def asked_terrain(self) -> bool:
@@ -347,7 +344,7 @@ class Exploration:
 
     def convinces(self) -> bool:
         """Return whether the best hypothesis is beyond doubt by itself."""
-        if not self.matches_by_itself() or self.pool.margin < self.settings.convincing_margin:
+        if not self.may_end_search() or self.pool.margin < self.settings.convincing_margin:
             return False
         best = self.pool.candidates[0]
         if best.ground is not None and best.ground.known and best.ground.spread_m > CONVINCING_SPREAD_M:
@@ -363,7 +360,7 @@ class Exploration:
     def promises(self) -> bool:
         """Return whether the best hypothesis stands out, so that the mirrored source may tell what by."""
         return (
-            self.matches_by_itself()
+            self.may_end_search()
             and self.pool.margin >= self.settings.convincing_margin
             and self.pool.candidates[0].neg_log10_p >= PROMISING_NEG_LOG10_P
         )

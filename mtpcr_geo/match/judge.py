@@ -26,7 +26,7 @@ from mtpcr_geo.method.solve import iterative_svd, ransac_upright
 
 CLEAR_MARGIN = 4.0
 """Times by which the best strength exceeds a hypothesis' score, which bounds its strength, where patches need
-not be asked: the margin could not fall below this."""
+not be asked: but for what the ground may tell for it, the margin could not fall below this."""
 MAX_RADIUS_CELLS = 10
 WIDE_PATCH_CELLS = 24
 """Cells along a patch from which the first look at a hypothesis is taken at cells twice as large."""

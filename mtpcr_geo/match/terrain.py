@@ -158,7 +158,7 @@ def compare_ground(
     height = cv2.remap(target.low, x, y, cv2.INTER_LINEAR)[:, 0]
     heights = [one[known].astype(np.float64) for one in (source.low[row, column], height)]
     places, step = placed[known], heights[1] - heights[0]
-    some = slice(None, None, max(1, cells // CELLS_OF_PLANE))
+    some = slice(None, None, -(-cells // CELLS_OF_PLANE))
     own, other = (_spread(_without_plane(places[some], one[some])) for one in heights)
     beyond_plane = float(np.hypot(own, other))
     if plane and cells >= 3 * FEWEST_CELLS:
@@ -174,16 +174,16 @@ def _spread(height: Floats) -> float:
     return 1.4826 * float(np.median(np.abs(height - np.median(height))))
 
 
-def _without_plane(xy: Floats, step: Floats) -> Floats:
-    """Take the best plane from (n,) height differences at (n, 2) places, outliers weighed down."""
+def _without_plane(xy: Floats, height: Floats) -> Floats:
+    """Take the best plane from (n,) heights at (n, 2) places, outliers weighed down."""
     centred = xy - xy.mean(axis=0)
-    # of a length of one, so that the normal equations stay well conditioned
+    # scaled to one, so that the normal equations stay well conditioned
     A = np.column_stack([np.ones(len(xy)), centred / max(float(np.abs(centred).max()), 1e-9)])
     weight = np.ones(len(xy))
-    rest = step
+    rest = height
     for _ in range(4):
         W = A * weight[:, None] ** 2
-        rest = step - A @ np.linalg.lstsq(W.T @ A, W.T @ step, rcond=None)[0]
+        rest = height - A @ np.linalg.lstsq(W.T @ A, W.T @ height, rcond=None)[0]
         scale = max(1.4826 * float(np.median(np.abs(rest))), NOISE_M)
         weight = 1.0 / (1.0 + (rest / (2.0 * scale)) ** 2)
     return np.asarray(rest)

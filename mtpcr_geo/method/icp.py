@@ -21,6 +21,8 @@ from mtpcr_geo.method.overlap import overlap_of
 
 FEWEST_POINTS = 60
 """Ten to each of the six parameters."""
+FEWEST_TRIMMED = 200
+"""Partners near by below which rounds take all points again."""
 FAR_DISTANCES_M = (3.0, 1.5)
 NEAR_DISTANCES_M = (1.0, 0.5)
 FINE_CELL_M = 2.0
@@ -34,6 +36,8 @@ and a result that does not stand still depends on the start."""
 ROUGH_SLACK, ROUGH_PARTNERS = 25.0, 7_500
 """For all rounds but the last: times the usual step at which they stand still, and partners that do."""
 NEIGHBOURS = 10
+FEWEST_THINNED = 2 * NEIGHBOURS
+"""Points left by thinning below which their surroundings tell nothing of surfaces."""
 FLAT = 4.0
 """Times that a flat neighbourhood spreads further along its surface than across it."""
 
@@ -146,6 +150,11 @@ class Surfaces:
         # each cloud is thinned in its own frame, so that a hair's breadth at the start changes no point
         s = transforms.apply(T_start, thinned(source[of_source], of_source, voxel_m, max_points))
         t = thinned(target[of_target], of_target, voxel_m, 3 * max_points)
+        if min(len(s), len(t)) < FEWEST_THINNED:
+            raise RegistrationError(
+                f"the overlap holds points in {only(min(len(s), len(t)), 'cell')} of {voxel_m:g} m only, and "
+                f"{FEWEST_THINNED} are needed to refine the pose: it brings hardly any of the clouds together"
+            )
         self._s, self._t = s - self._pivot, t - self._pivot
         self._source, self._target = small_gicp.PointCloud(self._s), small_gicp.PointCloud(self._t)
         self._source_tree = self._with_surfaces(self._source)
@@ -251,7 +260,7 @@ class Surfaces:
         """Return the source's points that have a partner near by; None, for all, where those are too few."""
         squared = np.asarray(self._tree.batch_knn_search(transforms.apply(X, self._s), 1, self._threads)[1])
         kept = np.flatnonzero(squared[:, 0] <= within_m**2)
-        return None if len(kept) < FEWEST_POINTS else kept
+        return None if len(kept) < FEWEST_TRIMMED else kept
 
     @cached_property
     def _descender(self) -> Descender:

@@ -10,6 +10,7 @@ import numpy as np
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.types import GroundFit, IcpMethod, IcpResult, IcpRound, IcpTrial, Refinement
 from mtpcr_geo.method.icp import Descent, Rounds, Surfaces, rounds_for
 from mtpcr_geo.method.jackknife import equations_of_surfaces
@@ -226,14 +227,17 @@ def _refined_finely(
     if settings.method is None or voxel > FINE_BELOW * settings.voxel_m:
         return None
     distance = FINE_DISTANCE_VOXELS * voxel
-    surfaces = Surfaces(
-        source,
-        target,
-        T_start,
-        voxel_m=voxel,
-        max_correspondence_distance_m=distance,
-        max_points=FINE_POINTS * settings.max_points,
-    )
+    try:
+        surfaces = Surfaces(
+            source,
+            target,
+            T_start,
+            voxel_m=voxel,
+            max_correspondence_distance_m=distance,
+            max_points=FINE_POINTS * settings.max_points,
+        )
+    except RegistrationError:
+        return None  # too few points lie so near each other: the rounds before stand
     run = surfaces.descend(
         T_start, Rounds((distance,), slack=FINE_SLACK), method=settings.method, iterations=settings.iterations
     )

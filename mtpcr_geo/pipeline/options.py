@@ -102,11 +102,11 @@ MatcherName = Annotated[
         "by its name (mtpcr-geo models lists them)"
     ),
 ]
-Proposals = Annotated[
+AskProposals = Annotated[
     bool,
     Field(
-        description="where neither heights nor terrain settle the search of the matcher correlation: let the "
-        "network of the matcher bev propose further poses, which are judged like all others"
+        description="let the network of the matcher bev propose further poses where neither heights nor "
+        "terrain settle the search of the matcher correlation; they are judged like all others"
     ),
     Shown(MATCHING),
 ]
@@ -368,7 +368,7 @@ class MethodOptions(PriorOptions):
     enhance: Annotated[
         bool, Field(description="sharpen the images (Eq. 4; profile paper)"), Shown(MATCHING)
     ] = True
-    proposals: Proposals = True
+    proposals: AskProposals = True
     seed: Seed = 0
 
 

@@ -421,7 +421,7 @@ class _Search:
         """Return whether the best stands out so far that no finer level need be searched."""
         pool = self.pools[0]
         return (
-            bool(pool.candidates)
+            pool.by_itself(self.judged[0])
             and pool.margin >= self.settings.convincing_margin
             and pool.candidates[0].neg_log10_p >= PROMISING_NEG_LOG10_P
             and pool.over(self.pools[1]) >= CONVINCING_NULL_RATIO

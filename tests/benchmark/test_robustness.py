@@ -426,13 +426,27 @@ def test_suites_run_with_options_of_register(data, tmp_path):
     done = CliRunner().invoke(app, [*command, *chosen])
     assert done.exit_code == 0, done.output
     (one,) = read_rows(out / "robustness.csv")
-    assert one["case"].endswith("start0/cell=2/proposals=False")
+    assert one["case"].endswith("start0/cell=2.0/proposals=False")
     assert one["metrics"]["cell_m"] == 2.0
+    # the same options in other words are the same run, and other ones want a folder of their own
+    again = CliRunner().invoke(
+        app, [*command, "--only", "town0", "-m", "mtpcr-geo:proposals=no,cell=2.0,focus=yes"]
+    )
+    assert again.exit_code == 0, again.output
+    assert len(read_rows(out / "robustness.csv")) == 1
+    other = CliRunner().invoke(app, [*command, "--only", "town0"])
+    assert other.exit_code == 2
+    assert "runs with other options" in " ".join(other.output.split())
 
 
 @pytest.mark.parametrize(
     ("method", "says"),
-    [("icp", "takes one method, mtpcr-geo"), ("mtpcr-geo:cel=2", "no option 'cel'; did you mean 'cell'?")],
+    [
+        ("icp", "takes one method, mtpcr-geo"),
+        ("mtpcr-geo:cel=2", "no option 'cel'; did you mean 'cell'?"),
+        ("mtpcr-geo:level=none", "set 'level' themselves"),
+        ("mtpcr-geo:matcher=rootsift,proposals=no", "belongs to --matcher correlation"),
+    ],
 )
 def test_suites_run_no_other_method(method, says, data, tmp_path):
     command = ["benchmark", "--robustness", "pairs", "--data", str(data), "--out", str(tmp_path / "out")]

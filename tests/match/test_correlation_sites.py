@@ -230,7 +230,7 @@ def test_a_pose_that_wins_by_the_ground_alone_ends_no_search() -> None:
     search = Exploration(
         source, target, scales_of(source, target), CorrelationSettings(), 0, lambda n: None,
     )  # fmt: skip
-    assert not search.matches_by_itself()
+    assert not search.may_end_search()
     fits, differs = GroundComparison(400, 0.05, 8, 0.9, 0.9), GroundComparison(400, 0.9, 8, 0.9, 0.9)
     for strength, among_the_strongest in ((10.0, False), (60.0, True)):
         search.judged = [
@@ -239,7 +239,7 @@ def test_a_pose_that_wins_by_the_ground_alone_ends_no_search() -> None:
         ]
         search._rank()
         assert search.pool.candidates[0] is search.judged[0]
-        assert search.matches_by_itself() == among_the_strongest
+        assert search.may_end_search() == among_the_strongest
 
 
 def test_tie_points_lie_where_the_best_hypothesis_puts_them() -> None:

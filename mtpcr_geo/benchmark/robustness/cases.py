@@ -104,7 +104,7 @@ class Case:
         place: number of the disc's place, or the target's site where that is another; "" else.
         asked_overlap: share of the source that shall be shared, where the recipe takes one.
         both_ways: register source and target exchanged too.
-        options: of `register`, beside those of the suite, as names and values.
+        options: further ones of `register`, none of which the suite sets, as names and values.
 
     """
 

@@ -64,7 +64,7 @@ def run_cases(
         progress: where to report runs.
 
     Raises:
-        OptionError: if two cases have one name, or the file has other columns.
+        OptionError: if two cases have one name, or the file has other columns, or runs by other options.
         InputError, OutputError: if the file cannot be read or written.
 
     """
@@ -75,6 +75,10 @@ def run_cases(
     if len(set(names)) < len(names):
         raise OptionError("two cases have the same name; their rows could not be told apart")
     there = {row["case"] for row in read_rows(path)} if Path(path).exists() else set()
+    # the sums of a folder do not ask by which options its runs were made
+    made_with = {_options_in(name) for name in [*there, *names]}
+    if len(made_with) > 1:
+        raise OptionError(f"{path} holds runs with other options of register; choose another folder")
     batches = _batches([case for case in todo if case.name not in there])
     count = sum(map(len, batches))
     with RowFile(path) as file, (progress or NoProgress()).task("robustness runs", count) as advance:
@@ -86,6 +90,13 @@ def run_cases(
         _drive(batches, jobs, time_limit_s, keep)
     wanted = set(names)
     return [row for row in read_rows(path) if row["case"] in wanted]
+
+
+def _options_in(name: str) -> tuple[str, ...]:
+    """Return the options of register that stand in a case's name, behind its start."""
+    parts = name.split("/")
+    starts = [k for k, part in enumerate(parts) if part.startswith("start") and part[5:].isdigit()]
+    return tuple(parts[starts[0] + 1 :]) if starts else ()
 
 
 def _batches(todo: Sequence[Case]) -> deque[deque[Case]]:

@@ -59,7 +59,7 @@ class SuiteOptions:
         seed: of all starts, places and simulated sites.
         only: keep cases whose site, kind or place contains one of these; all if empty.
         shift_m: starts are moved by up to this, metres.
-        register: further options of `register`, as names and values.
+        register_options: further options of `register`, as names and values.
 
     """
 
@@ -69,7 +69,7 @@ class SuiteOptions:
     seed: int = 0
     only: tuple[str, ...] = ()
     shift_m: float = 100.0
-    register: tuple[tuple[str, Any], ...] = ()
+    register_options: tuple[tuple[str, Any], ...] = ()
 
     @property
     def ranges(self) -> StartRange:
@@ -104,7 +104,7 @@ def cases(names: Sequence[str], options: SuiteOptions) -> Iterator[Case]:
         for case in SUITES[name](options):
             words = (case.site, case.kind, case.place)
             if not options.only or any(part in word for part in options.only for word in words):
-                yield replace(case, options=options.register)
+                yield replace(case, options=options.register_options)
 
 
 def suite_names(names: Sequence[str]) -> list[str]:

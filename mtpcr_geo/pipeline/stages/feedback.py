@@ -95,8 +95,8 @@ def fed_back(
     if free is None or not LEAST_TILT_DEG <= tilt_between_deg(pair, free) <= MOST_TILT_DEG:
         return None
     side = replace(pair.source, levelling=levelled_by(pair, free), bev=None, appearance=None)
-    again = pair.with_(source=replace(side, bev=rasterise(side, source.grid.cell)), refinement=None)
     try:
+        again = pair.with_(source=replace(side, bev=rasterise(side, source.grid.cell)), refinement=None)
         again = _solved(again, pair)
         found = again.matches
         assert found is not None
@@ -143,10 +143,11 @@ def matched_coarser(
     if (matches.margin or 0.0) < SURE or (matches.null_ratio is not None and matches.null_ratio < SURE):
         return None
     cell = COARSER * pair.cell
-    sides = [replace(side, bev=rasterise(side, cell), appearance=None) for side in (pair.source, pair.target)]
-    again = pair.with_(source=sides[0], target=sides[1], refinement=None)
     try:
-        again = _solved(again, pair)
+        source, target = (
+            replace(side, bev=rasterise(side, cell), appearance=None) for side in (pair.source, pair.target)
+        )
+        again = _solved(pair.with_(source=source, target=target, refinement=None), pair)
         assert again.matches is not None
         if cell * (again.matches.strength or 0.0) <= pair.cell * (matches.strength or 0.0):
             return None  # in metres the strength is the same at any cell that is filled well

@@ -13,7 +13,7 @@ from pydantic import Field
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.system import core_limit
 from mtpcr_geo.core.types import Appearance, Bev, Look, Pair, Side
-from mtpcr_geo.pipeline.options import MatcherName, Models, PriorOptions, Proposals, Seed, Threads
+from mtpcr_geo.pipeline.options import AskProposals, MatcherName, Models, PriorOptions, Seed, Threads
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 from mtpcr_geo.pipeline.stages.pairs import bevs_of
 from mtpcr_geo.pipeline.stages.priors import audit_of, known_place, prior_of
@@ -100,7 +100,7 @@ class MatchOptions(PriorOptions, StageOptions):
         description="where a vertical is not known and the matches under the likeliest one do not convince: "
         "level, rasterise and match again under others, and keep the strongest",
     )
-    proposals: Proposals = True
+    proposals: AskProposals = True
     models: Models = None
     turns: int | None = Field(
         None,

@@ -139,6 +139,8 @@ def _match_options(options: MethodOptions, matcher: str) -> MatchOptions:
     # what is not given stays so, as in pipelines written by hand
     known = {name: getattr(options, name) for name in PriorOptions.model_fields}
     if not options.proposals:
+        if matcher != "correlation":
+            raise OptionError("--no-proposals belongs to --matcher correlation")
         known["proposals"] = False
     tried = options.level == "auto"
     return MatchOptions(method=matcher, models=models, verticals=tried, seed=options.seed, **known)
@@ -152,9 +154,7 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
         )
     seed = options.seed
     matcher = options.matcher or "bev"
-    if not options.proposals:
-        raise OptionError("--no-proposals belongs to --matcher correlation, which is not of the paper")
-    match = MatchOptions(method=matcher, models=options.models, seed=seed)
+    match = _match_options(options, matcher)
     # weights trained on height images see nothing in others, and want one cell for both clouds; any other
     # matcher gets the paper's image (Eq. 3 and 4) and cells (Eq. 1)
     trained_on = look_of(matcher, models_folder(options.models))
