@@ -8,6 +8,7 @@ and what to do.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from mtpcr_geo.core.types import Verdict, VerdictName
@@ -58,6 +59,8 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
     else:
         judged = probability_finding(evidence, limits, probability)
         weak = False  # the probability weighs the evidence together already
+        if probability >= limits.sure_probability:
+            limits = replace(limits, ground_shape=max(limits.ground_shape, limits.ground_shape_if_sure))
     judgements: dict[str, list[CheckFinding | None]] = {
         "probability": [judged],
         "tie points": [few_finding(evidence)],

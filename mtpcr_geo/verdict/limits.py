@@ -109,6 +109,8 @@ class Limits:
         ground_shape: most spread of the height differences between both grounds, as a share of the relief
             that they have, to accept. Of two places that have nothing to do with each other it is 1.4; under
             true poses of repeating sites it is 0.2 at most, under wrong ones 1.0 to 1.7.
+        sure_probability, ground_shape_if_sure: probability from which that share may be larger, and how
+            large: crops and brush of one of two dates spread the ground of the right place by 0.4 to 0.8.
         objects_missing: greatest share of objects missing in the other cloud to accept.
 
     """
@@ -124,4 +126,6 @@ class Limits:
     refined_away: float = 2.0
     ground_agreeing: float = 0.7
     ground_shape: float = 0.35
+    sure_probability: float = 0.97
+    ground_shape_if_sure: float = 0.7
     objects_missing: float = 0.10

@@ -32,6 +32,17 @@ def test_good_evidence_is_accepted_with_its_grounds() -> None:
     assert "chance would make 2 of 40" in verdict.reasons[0]
 
 
+def test_crops_on_the_ground_of_a_pose_that_is_sure_are_borne() -> None:
+    sure = replace(GOOD, null_ratio=6.0, margin=12.0, ground_relief_m=0.4)
+    assert [assess(replace(sure, ground_spread_m=spread), Limits()).name for spread in (0.2, 0.36)] == [
+        "accepted", "doubtful",
+    ]  # fmt: skip
+    # where the rest is less sure it is a doubt
+    less = replace(sure, margin=1.6, held_out_agreeing=10, ground_spread_m=0.2)
+    assert assess(less, Limits()).name != "accepted"
+    assert assess(replace(less, ground_spread_m=0.05), Limits()).name == "accepted"
+
+
 @pytest.mark.parametrize(
     ("change", "name"),
     [
