@@ -43,6 +43,8 @@ _LABELS = {
     "ground_checked": "enough ground to judge by",
     "ground_spread_m": "ground, spread of the height differences",
     "ground_relief_m": "ground, relief",
+    "ground_noise_m": "ground, spread that its noise explains",
+    "repeats": "scene repeats itself",
     "probability": "probability of being right (5 degrees, 2 m)",
     "probability_precise": "probability of being precise (0.2 degrees, 0.5 m)",
     "refinement_lost": "refinement lost the tie points",

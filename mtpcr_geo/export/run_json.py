@@ -107,6 +107,9 @@ The metrics:
 - ``metrics.ground_spread_m``: spread of the height differences between both grounds, in blocks; null if
   unknown
 - ``metrics.ground_relief_m``: relief of the ground in those blocks, a plane taken off; null if unknown
+- ``metrics.ground_noise_m``: what that spread would be if all of it came of the scatter of the cells within
+  the blocks; null if unknown
+- ``metrics.repeats``: whether the scene under the pose fits itself after a shift, as rows do
 - ``metrics.probability``: probability of being within 5 degrees and 2 m of the truth, from a model fitted to
   runs of known answer; null from keypoints
 - ``metrics.probability_precise``: the same of being within 0.2 degrees and 0.5 m, from that and from the
@@ -229,6 +232,10 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
   on each pose, less the two that always do
 - ``mtpcr.match ground_spread_m``: robust spread of the differences between both grounds' heights under each
   of them; null where too little ground is compared
+- ``mtpcr.match ground_relief_m``: what it would be if neither ground told anything of the other; null
+  likewise
+- ``mtpcr.match ground_beyond_plane_m``: the same of what is left of each ground beside its own plane; null
+  likewise
 - ``mtpcr.match mirrored_strengths``: score times support of the hypotheses of the mirrored source; null where
   it was not searched; from keypoints that vote, pairs that agree on each, less two
 - ``mtpcr.match self_likeness``: correlation of the scene under the best hypothesis with itself, moved: a

@@ -65,11 +65,16 @@ class CommonGround:
         column, row = np.floor(self.xy / side).astype(np.int64).T
         groups = Groups.of(column, row, FEWEST_IN_BLOCK)
         if len(groups) < FEWEST_BLOCKS:
-            return GroundShape(len(groups), np.inf, 0.0)
+            return GroundShape(len(groups), np.inf, 0.0, 0.0)
         xy = np.column_stack([groups.means(axis) for axis in self.xy.T])
         reliefs = [_robust_spread(_without_plane(xy, groups.medians(z))) for z in (self.source, self.target)]
-        spread = _robust_spread(groups.medians(self.step))
-        return GroundShape(len(groups), spread, float(np.sqrt(np.mean(np.square(reliefs)))))
+        steps = groups.medians(self.step)
+        spread = _robust_spread(steps)
+        # the median of n values of a normal distribution spreads by 1.25 sigma / sqrt(n)
+        beside = np.zeros(len(self.xy))
+        beside[groups.order] = np.abs(self.step[groups.order] - steps[groups.number])
+        noise = float(np.median(1.25 * 1.4826 * groups.medians(beside) / np.sqrt(groups.sizes)))
+        return GroundShape(len(groups), spread, float(np.sqrt(np.mean(np.square(reliefs)))), noise)
 
 
 @dataclass(frozen=True)
@@ -82,12 +87,15 @@ class GroundShape:
             where too few blocks could be compared.
         relief_m: robust standard deviation of the heights themselves about a plane, metres. Of places that
             have nothing to do with each other the heights differ by about 1.4 times this.
+        noise_m: what the spread would be if all of it came of the scatter of the cells within the blocks,
+            metres.
 
     """
 
     blocks: int
     spread_m: float
     relief_m: float
+    noise_m: float
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ from mtpcr_geo.verdict.findings import (
     overlap_finding,
     probability_finding,
     refinement_findings,
+    terrain_of_rows_finding,
 )
 from mtpcr_geo.verdict.limits import Evidence, Limits
 from mtpcr_geo.verdict.probability import probability_of, probability_of_precise
@@ -59,7 +60,7 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
     else:
         judged = probability_finding(evidence, limits, probability)
         weak = False  # the probability weighs the evidence together already
-        if probability >= limits.sure_probability:
+        if probability >= limits.sure_probability and not evidence.repeats:
             limits = replace(limits, ground_shape=max(limits.ground_shape, limits.ground_shape_if_sure))
     judgements: dict[str, list[CheckFinding | None]] = {
         "probability": [judged],
@@ -68,7 +69,7 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
         "mirrored source": [null_finding(evidence, limits)],
         "refinement": [*refinement_findings(evidence, limits)],
         "ground heights": [ground_finding(evidence, limits)],
-        "ground shape": [ground_shape_finding(evidence, limits)],
+        "ground shape": [ground_shape_finding(evidence, limits), terrain_of_rows_finding(evidence, limits)],
         "objects": [objects_finding(evidence, limits)],
         "shared ground": [overlap_finding(evidence, limits)],
     }
@@ -115,6 +116,8 @@ def metrics_of(evidence: Evidence) -> dict[str, Any]:
         "ground_checked": ground_checked(evidence),
         "ground_spread_m": evidence.ground_spread_m,
         "ground_relief_m": evidence.ground_relief_m,
+        "ground_noise_m": evidence.ground_noise_m,
+        "repeats": evidence.repeats,
         "objects_missing": evidence.objects_missing,
         "refined_away_m": evidence.refined_away_m,
         "refinement_lost": evidence.refinement_lost,

@@ -8,6 +8,7 @@ from mtpcr_geo.core.statistics import neg_log10_p
 from mtpcr_geo.core.types import Rival
 from mtpcr_geo.core.wording import beside, only, percent
 from mtpcr_geo.verdict.limits import Evidence, Limits
+from mtpcr_geo.verdict.probability import rows_over_noise
 
 FEWEST_GROUND_CELLS = 30
 FEWEST_HELD_OUT = 4
@@ -249,6 +250,22 @@ def ground_shape_finding(evidence: Evidence, limits: Limits) -> CheckFinding | N
         f"the ground of the two clouds differs in shape by {spread:.2f} m, where it rises and falls by "
         f"{relief:.2f} m in each (wanted at most {limits.ground_shape * relief:.2f} m): the place is wrong, "
         "or the ground has changed"
+    )
+
+
+def terrain_of_rows_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
+    """Judge, where the scene repeats itself, whether the ground agrees as far as its noise lets one see.
+
+    Among rows the terrain decides, and of many places with the same rows on gentle terrain one fits by
+    chance, though not to the noise.
+    """
+    ratio = rows_over_noise(evidence.repeats, evidence.ground_spread_m, evidence.ground_noise_m)
+    if ratio is None or ratio <= limits.ground_noise_of_rows:
+        return None
+    return CheckFinding(
+        f"the scene repeats itself, and the ground beneath it differs by {evidence.ground_spread_m:.2f} m, "
+        f"{ratio:.0f} times what its noise explains (wanted at most {limits.ground_noise_of_rows:g}): other "
+        "rows on similar terrain look so; give more of what lies around it, or say where it is (--near)"
     )
 
 

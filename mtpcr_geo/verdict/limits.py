@@ -34,8 +34,10 @@ class Evidence:
         overlap_source, overlap_target: shares of each cloud's area that lie in the overlap.
         ground_cells: cells where both see the ground.
         ground_agreeing: of these, cells whose heights agree.
-        ground_spread_m, ground_relief_m: spread of the height differences between both grounds, and relief
-            that they have, metres, see `method.overlap.GroundShape`; None where it was not to be told.
+        ground_spread_m, ground_relief_m, ground_noise_m: spread of the height differences between both
+            grounds, relief that they have, and spread that their noise explains, metres, see
+            `method.overlap.GroundShape`; None where it was not to be told.
+        repeats: whether the scene under the pose fits itself after a shift, as rows do.
         refined_away_m: how far the refinement moved the overlap from the solution in plan, metres.
         final_agreeing: of all tie points, those that agree with the final transform; None if not counted.
         refinement_lost: whether surfaces fit better where the tie points do not agree, and the tie points
@@ -74,6 +76,8 @@ class Evidence:
     contradictions: tuple[str, ...] = ()
     ground_spread_m: float | None = None
     ground_relief_m: float | None = None
+    ground_noise_m: float | None = None
+    repeats: bool = False
     missing: str | None = None
     rivals: tuple[Rival, ...] = ()
     mapped: bool = True
@@ -111,6 +115,9 @@ class Limits:
             true poses of repeating sites it is 0.2 at most, under wrong ones 1.0 to 1.7.
         sure_probability, ground_shape_if_sure: probability from which that share may be larger, and how
             large: crops and brush of one of two dates spread the ground of the right place by 0.4 to 0.8.
+        ground_noise_of_rows: where the scene repeats itself, most spread of the height differences between
+            both grounds, as a multiple of their noise, to accept: under right poses of simulated rows it is 3
+            to 9, on terrain that fits by chance 21 to 35.
         objects_missing: greatest share of objects missing in the other cloud to accept.
 
     """
@@ -128,4 +135,5 @@ class Limits:
     ground_shape: float = 0.35
     sure_probability: float = 0.97
     ground_shape_if_sure: float = 0.7
+    ground_noise_of_rows: float = 12.0
     objects_missing: float = 0.10

@@ -45,13 +45,19 @@ FIT = ("margin", "agreement", "ground_shape", "ground_agreement", "refinement")
 - refinement: -1 where surfaces fit better where the tie points do not agree.
 """
 
-UNIQUE = ("mirror", "objects")
+UNIQUE = ("mirror", "objects", "rows")
 """What says that no other pose looks alike, likewise:
 
 - mirror: logarithm of the strength over the best of the mirrored source, up to where it is clear of it: a
   scene without a right pose reaches as much, and most sites that fit themselves after half a turn do;
-- objects: minus the share of one cloud's objects at whose place the other sees bare ground.
+- objects: minus the share of one cloud's objects at whose place the other sees bare ground;
+- rows: where the scene repeats itself, minus the logarithm of the ground's spread over its noise, from
+  `ROWS_OVER_NOISE` on: of many places with the same rows the terrain of one fits by chance, not to the noise.
 """
+
+ROWS_OVER_NOISE, LEAST_GROUND_NOISE_M, MOST_OF_ROWS = 10.0, 0.0025, 1.5
+"""Spread of the ground over its noise that right poses among rows have at most, the least noise that is
+believed, and logarithm of that ratio over the first beyond which more says no more."""
 
 
 PRECISE = ("plan", "rotation")
@@ -82,6 +88,8 @@ def features_of(metrics: Mapping[str, Any]) -> Floats | None:
     shape = 0.0
     if spread is not None and relief is not None:
         shape = float(np.clip(np.log((relief + RELIEF_NOISE_M) / (spread + RELIEF_NOISE_M)), *GROUND_CLEAR))
+    over_noise = rows_over_noise(bool(metrics.get("repeats")), spread, metrics.get("ground_noise_m"))
+    of_rows = 0.0 if over_noise is None else float(np.log(over_noise / ROWS_OVER_NOISE))
     cells = metrics.get("ground_cells") or 0
     share = (metrics.get("ground_agreeing") or 0) / max(cells, 1) - GROUND_EXPECTED
     return np.array(
@@ -93,8 +101,16 @@ def features_of(metrics: Mapping[str, Any]) -> Floats | None:
             -1.0 if metrics.get("refinement_lost") else 0.0,
             np.log(np.clip(null, RATIOS[0], CLEAR_OF_MIRROR)),
             -min(metrics.get("objects_missing") or 0.0, MOST_MISSING) / MISSING_UNIT,
+            -min(max(of_rows, 0.0), MOST_OF_ROWS),
         ]
     )
+
+
+def rows_over_noise(repeats: bool, spread_m: float | None, noise_m: float | None) -> float | None:
+    """Return the ground's spread over its noise; None if that is unknown, or nothing repeats."""
+    if not repeats or spread_m is None or noise_m is None or spread_m <= 0.0:
+        return None
+    return spread_m / max(noise_m, LEAST_GROUND_NOISE_M)
 
 
 def precise_features_of(metrics: Mapping[str, Any]) -> Floats | None:
