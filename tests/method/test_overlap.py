@@ -8,7 +8,7 @@ from helpers_plots import plot, terrain
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.method.bev import grid_around, rasterise
-from mtpcr_geo.method.overlap import _ground, overlap_of
+from mtpcr_geo.method.overlap import CommonGround, _ground, overlap_of
 from mtpcr_geo.method.refine import settle_on_ground
 
 
@@ -90,10 +90,24 @@ def test_grounds_of_one_place_have_one_shape_and_of_two_places_have_not() -> Non
     assert same.blocks > 50
     assert same.spread_m < 0.05
     assert same.relief_m > 5 * same.spread_m
+    assert 0.0 < same.noise_m < 0.05
     # the slope falls alike everywhere, and is no sign of one place: what rolls on it is
     moved = source + [31.0, 17.0, 3.1]
     other = overlap_of(moved, target).common_ground().shape()
     assert other.spread_m > 0.7 * other.relief_m
+    assert other.spread_m > 12.0 * other.noise_m
+
+
+def test_noise_of_the_ground_explains_the_spread_under_the_right_place_alone() -> None:
+    rng = np.random.default_rng(8)
+    xy = rng.uniform(-60.0, 60.0, (6000, 2))
+    low = 0.4 * np.sin(xy[:, 0] / 20.0)
+    noisy = low + rng.normal(scale=0.05, size=len(xy))
+    right = CommonGround(xy, low, noisy, 1.0).shape()
+    assert right.spread_m == pytest.approx(right.noise_m, rel=0.3)
+    # terrain that fits by chance, to a fifth of its relief
+    similar = CommonGround(xy, low, noisy + 0.08 * np.sin(xy[:, 1] / 20.0), 1.0).shape()
+    assert similar.spread_m > 4.0 * similar.noise_m
 
 
 def test_too_little_ground_has_no_shape() -> None:

@@ -91,6 +91,21 @@ def test_another_place_with_the_same_rows_is_caught_by_the_shape_of_its_ground()
     assert any("differs in shape" in reason for reason in verdict.reasons)
 
 
+def test_among_rows_the_ground_must_agree_to_its_noise() -> None:
+    rows = replace(CLEAR, repeats=True, ground_spread_m=0.02, ground_noise_m=0.0028)
+    assert assess(rows, Limits()).name == "accepted"
+    by_chance = replace(rows, ground_spread_m=0.08)
+    verdict = assess(by_chance, Limits())
+    assert verdict.name != "accepted"
+    assert any("repeats itself" in reason for reason in verdict.reasons)
+    assert probability(repeats=True, ground_spread_m=0.08, ground_noise_m=0.0028) < probability(
+        repeats=False, ground_spread_m=0.08, ground_noise_m=0.0028
+    )
+    # of a scene that does not repeat itself it is not asked, nor where the noise is not known
+    assert assess(replace(by_chance, repeats=False), Limits()).name == "accepted"
+    assert assess(replace(by_chance, ground_noise_m=None), Limits()).name == "accepted"
+
+
 def test_too_few_tie_points_are_never_accepted_however_clear_the_rest() -> None:
     verdict = assess(replace(CLEAR, margin=20.0, null_ratio=20.0, held_out=3, held_out_agreeing=3), Limits())
     assert verdict.name == "doubtful"
