@@ -56,8 +56,8 @@ UNIQUE = ("mirror", "objects", "rows")
 """
 
 ROWS_OVER_NOISE, LEAST_GROUND_NOISE_M, MOST_OF_ROWS = 10.0, 0.0025, 1.5
-"""Spread of the ground over its noise that right poses among rows have at most, the least noise that is
-believed, and logarithm of that ratio over the first beyond which more says no more."""
+"""Spread of the ground over its noise that right poses among rows hardly exceed (11 at most), the least noise
+that is believed, and logarithm of that ratio over the first beyond which more says no more."""
 
 
 PRECISE = ("plan", "rotation")

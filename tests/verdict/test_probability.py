@@ -98,6 +98,8 @@ def test_among_rows_the_ground_must_agree_to_its_noise() -> None:
     verdict = assess(by_chance, Limits())
     assert verdict.name != "accepted"
     assert any("repeats itself" in reason for reason in verdict.reasons)
+    (shape,) = (check for check in verdict.checks if check.name == "ground shape")
+    assert (shape.passed, shape.wanted) == (False, "at most 0.03 m")
     assert probability(repeats=True, ground_spread_m=0.08, ground_noise_m=0.0028) < probability(
         repeats=False, ground_spread_m=0.08, ground_noise_m=0.0028
     )
