@@ -282,6 +282,8 @@ def main() -> None:
     """Run the command."""
     # what fails in rerun's threads, as on a full disk, is an error of ours, told in one line
     os.environ.setdefault("RUST_LOG", "off")
+    # pydantic would read the metadata of every package installed, to look for plugins
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     signal.signal(signal.SIGTERM, _interrupt)
     app(prog_name=NAME)
 

@@ -61,6 +61,8 @@ def follow(pyramid: Pyramid, factor: int, poses: Sequence[Pose], worth: float = 
     found: list[Pose] = []
     growth = 0.0
     with ThreadPoolExecutor(usable_cores()) as threads:
+        if poses:
+            pyramid.prepare(levels_below(factor), threads)
         for start in range(0, len(poses), FEWEST_FOLLOWED):
             some = poses[start : start + FEWEST_FOLLOWED]
             reach = GROWTH_MARGIN * growth * max(pose.score for pose in some)
@@ -72,6 +74,18 @@ def follow(pyramid: Pyramid, factor: int, poses: Sequence[Pose], worth: float = 
             )
             found += fine
     return Descent(tuple(found))
+
+
+def levels_below(factor: int) -> list[int]:
+    """Return the levels that a pose of one passes on its way down: that one first, the finest last."""
+    levels = [factor]
+    while levels[-1] > 1:
+        levels.append(_finer(levels[-1]))
+    return levels
+
+
+def _finer(level: int) -> int:
+    return max(1, level // 2)
 
 
 def comb_each(pyramid: Pyramid, poses: Sequence[Pose], reach_m: float) -> list[Pose]:
@@ -133,7 +147,7 @@ def _follow_one(
         pose = tries[best]
         if level == 1:
             return score_nearby(source, target, pose, 1)[0]
-        finer = max(1, level // 2)
+        finer = _finer(level)
         # the centre of the raster moves a little between levels: same pose, other pivot
         hypothesis = pose.hypothesis(centre_of(source.grid))
         pose = pose_of(hypothesis, centre_of(pyramid.at(finer)[0].grid))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,11 +49,20 @@ class Pyramid:
 
     def at(self, factor: int) -> tuple[Layer, Layer]:
         """Return source and target layers at ``factor`` times the finest cell."""
-        for bev, layers in ((self.source, self._source), (self.target, self._target)):
-            if factor not in layers:
-                coarse = coarsen(bev, factor)
-                layers[factor] = Layer(coarse.grid, channels(coarse))
-        return self._source[factor], self._target[factor]
+        return self._layer(self.source, self._source, factor), self._layer(self.target, self._target, factor)
+
+    def prepare(self, factors: Iterable[int], threads: Executor) -> None:
+        """Make the layers of several levels at once, so that threads that need them do not each make them."""
+        sides = ((self.source, self._source), (self.target, self._target))
+        wanted = [(bev, layers, factor) for factor in factors for bev, layers in sides]
+        for done in [threads.submit(self._layer, *one) for one in wanted]:
+            done.result()
+
+    def _layer(self, bev: Bev, layers: dict[int, Layer], factor: int) -> Layer:
+        if factor not in layers:
+            coarse = coarsen(bev, factor)
+            layers[factor] = Layer(coarse.grid, channels(coarse))
+        return layers[factor]
 
 
 def search_factors(source: Bev, target: Bev) -> list[int]:

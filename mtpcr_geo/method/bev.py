@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,18 +169,20 @@ def coarsen(bev: Bev, factor: int) -> Bev:
     row0 = round(-grid.north / grid.cell) % factor
     width = -(-(grid.width + column0) // factor)
     height = -(-(grid.height + row0) // factor)
-    pad = (
-        (row0, height * factor - grid.height - row0),
-        (column0, width * factor - grid.width - column0),
-    )
-    blocks = (height, factor, width, factor)
 
-    def joined(band: NDArray[np.float32], fill: float, pick: np.ufunc) -> NDArray[np.float32]:
-        filled = np.where(np.isnan(band), np.float32(fill), band)
-        padded = np.pad(filled, pad, constant_values=fill).reshape(blocks)
-        return np.asarray(pick.reduce(pick.reduce(padded, axis=3), axis=1))
+    def joined(band: NDArray[Any], fill: float, pick: np.ufunc) -> NDArray[Any]:
+        # whole rows first, then columns of the few rows left: both run along memory, where a reduction over
+        # the short axes of blocks takes four times as long
+        padded = np.full((height * factor, width * factor), fill, band.dtype)
+        inner = padded[row0 : row0 + grid.height, column0 : column0 + grid.width]
+        np.copyto(inner, band, where=~np.isnan(band) if band.dtype.kind == "f" else True)
+        rows = pick.reduce(padded.reshape(height, factor, width * factor), axis=1, dtype=band.dtype)
+        whole = rows[:, ::factor].copy()
+        for column in range(1, factor):
+            pick(whole, rows[:, column::factor], out=whole)
+        return np.asarray(whole)
 
-    count = np.pad(bev.count, pad).reshape(blocks).sum(axis=(1, 3), dtype=np.uint32)
+    count = joined(bev.count, 0, np.add)
     top = joined(bev.top, -np.inf, np.maximum)
     low = joined(bev.low, np.inf, np.minimum)
     empty = count == 0

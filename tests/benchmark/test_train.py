@@ -23,7 +23,7 @@ from mtpcr_geo.core.errors import MissingPartError
 
 TINY = Recipe(
     sites=1, draws=2, feature_steps=12, batch=2, size=64, width=16, matcher_pairs=6, matcher_epochs=2,
-    matcher_size=96, keypoints=48, device="cpu", precision="float32",
+    matcher_size=96, keypoints=48, device="cpu",
 )  # fmt: skip
 
 
@@ -139,6 +139,8 @@ def test_a_tiny_training_gives_files_that_match(tmp_path, town_views):
         path.name for path in (tmp_path / "a").iterdir()
     }
     assert json.loads((tmp_path / "a" / "run.json").read_text()) == facts
+    assert facts["recipe"]["precision"] == "auto"
+    assert facts["precision"] in ("float32", "bfloat16")
     curve = (tmp_path / "a" / "curve.csv").read_text().splitlines()
     losses = [float(line.split(",")[3]) for line in curve if ",descriptor," in line]
     assert losses[-1] < losses[0]
