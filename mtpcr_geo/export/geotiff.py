@@ -264,15 +264,12 @@ def warp_bev(bev: Bev, T_to_bev: Floats, grid: Grid) -> Bev:
     count = np.zeros(grid.shape, np.uint32)
     rows_at_once = max(1, _WARP_CELLS // grid.width)
     for start in range(0, grid.height, rows_at_once):
-        rows = np.arange(start, min(start + rows_at_once, grid.height))
-        row = np.repeat(rows, grid.width)
-        column = np.tile(np.arange(grid.width), len(rows))
-        plan = grid.to_metres(np.column_stack([column, row]).astype(np.float64))
-        found, xyz_bev, index = _source_cells(bev, filled, T_to_bev, plan, height)
-        row, column, xyz_bev, index = row[found], column[found], xyz_bev[found], index[found]
-        top[row, column] = _move_z(T_to_bev, xyz_bev, bev.top.ravel()[index])
-        low[row, column] = _move_z(T_to_bev, xyz_bev, bev.low.ravel()[index])
-        count[row, column] = bev.count.ravel()[index]
+        rows = slice(start, min(start + rows_at_once, grid.height))
+        found, place, index = _source_cells(bev, filled, T_to_bev, grid, rows, height)
+        for band, values in ((top, bev.top), (low, bev.low)):
+            moved = _move_z(T_to_bev, *place, values.ravel()[index])
+            np.copyto(band[rows], moved, where=found, casting="same_kind")
+        np.copyto(count[rows], bev.count.ravel()[index], where=found)
     if _tilts(T_to_bev):
         _add_missed(bev, filled, T_to_bev, Bev(grid, top, low, count))
     return Bev(grid, top, low, count)
@@ -301,20 +298,30 @@ def _add_missed(bev: Bev, filled: Mask, T_to_bev: Floats, warped: Bev) -> None:
 
 
 def _source_cells(
-    bev: Bev, filled: Mask, T_to_bev: Floats, plan: Floats, height: float
-) -> tuple[Mask, Floats, NDArray[np.int64]]:
-    """Return the BEV's cell for each of (n, 2) places: found or not, (n, 3) place in the BEV, flat index."""
-    T_bev_to = transforms.inverse(T_to_bev)
-    z_to = np.full(len(plan), (T_to_bev @ np.array([0.0, 0.0, height, 1.0]))[2])
+    bev: Bev, filled: Mask, T_to_bev: Floats, grid: Grid, rows: slice, height: float
+) -> tuple[Mask, tuple[Floats, Floats], NDArray[np.int64]]:
+    """Return the BEV's cell for each cell of some rows of a grid.
+
+    Returns:
+        (h, w) whether one is there; (h, w) each, east and north in the BEV, metres; (h, w) its flat index.
+
+    """
+    T, own = transforms.inverse(T_to_bev), bev.grid
+    # columns and rows of a grid are each one coordinate: sums of a row and a column stand for all cells
+    x = grid.west + (np.arange(grid.width) + 0.5) * grid.cell
+    y = grid.north - (np.arange(rows.start, rows.stop)[:, None] + 0.5) * grid.cell
+    z: Any = (T_to_bev @ np.array([0.0, 0.0, height, 1.0]))[2]
     for last in (False, False, True) if _tilts(T_to_bev) else (True,):
-        xyz_bev = transforms.apply(T_bev_to, np.column_stack([plan, z_to]))
-        pixel = np.rint(bev.grid.to_pixel(xyz_bev[:, :2])).astype(np.int64)
-        inside = ((pixel >= 0) & (pixel < [bev.grid.width, bev.grid.height])).all(axis=1)
-        index = np.where(inside, pixel[:, 1] * bev.grid.width + pixel[:, 0], 0)
+        east = (T[0, 0] * x + T[0, 3]) + (T[0, 1] * y + T[0, 2] * z)
+        north = (T[1, 0] * x + T[1, 3]) + (T[1, 1] * y + T[1, 2] * z)
+        column = np.rint((east - own.west) / own.cell - 0.5).astype(np.int64)
+        row = np.rint((own.north - north) / own.cell - 0.5).astype(np.int64)
+        inside = own.holds(column, row)
+        index = np.where(inside, row * own.width + column, 0)
         found = inside & filled.ravel()[index]
         if not last:
-            z_to = np.where(found, _move_z(T_to_bev, xyz_bev, bev.top.ravel()[index]), z_to)
-    return found, xyz_bev, index
+            z = np.where(found, _move_z(T_to_bev, east, north, bev.top.ravel()[index]), z)
+    return found, (east, north), index
 
 
 def geotransform(grid: Grid, origin: Floats) -> Any:
@@ -334,9 +341,12 @@ def overview_levels(grid: Grid) -> int:
     return levels
 
 
-def _move_z(T: Floats, xyz: Floats, z: Image) -> Floats:
-    """Return heights after T of points with the plan position of `xyz` and height `z`."""
-    return np.asarray(T[2, 0] * xyz[:, 0] + T[2, 1] * xyz[:, 1] + T[2, 2] * z + T[2, 3])
+def _move_z(T: Floats, east: Floats, north: Floats, z: Image) -> Floats:
+    """Return heights after T of points at places with heights `z`, all of one shape."""
+    moved = T[2, 2] * z + T[2, 3]
+    if T[2, 0] == T[2, 1] == 0.0:
+        return np.asarray(moved)
+    return np.asarray(moved + (T[2, 0] * east + T[2, 1] * north))
 
 
 def _absolute(z: Image, frame: WorkFrame) -> Image:

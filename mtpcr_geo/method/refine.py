@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -11,6 +12,7 @@ import numpy as np
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import RegistrationError
+from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import GroundFit, IcpMethod, IcpResult, IcpRound, IcpTrial, Refinement
 from mtpcr_geo.method.icp import Descent, Rounds, Surfaces, rounds_for
 from mtpcr_geo.method.jackknife import equations_of_surfaces
@@ -291,10 +293,12 @@ def follow_icp(
 
     """
     *_, last = starts
-    runs = {
-        name: surfaces.descend(starts[last], one, method=method, iterations=iterations)
-        for name, one in rounds.items()
-    }
+    with ThreadPoolExecutor(min(len(rounds), usable_cores()) or 1) as threads:
+        begun = {
+            name: threads.submit(surfaces.descend, starts[last], one, method=method, iterations=iterations)
+            for name, one in rounds.items()
+        }
+        runs = {name: run.result() for name, run in begun.items()}
     tried = {name: T for name, T in starts.items() if keep_tie_points > 0} | {
         name: run.T for name, run in runs.items()
     }

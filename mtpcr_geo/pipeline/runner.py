@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -156,7 +156,9 @@ def run(
 
     """
     stages = [node.stage for node in nodes]
-    inputs = _inputs_behind_late(nodes)
+    inputs = _inputs_behind(nodes, lambda stage: stage.late)
+    # what a writer of evidence gets was made before the writers in front of it
+    made_by = _inputs_behind(nodes, lambda stage: stage.evidence)
     values: dict[str, Value | None] = dict(before.values) if before is not None else {}
     with OutputSet(overwrite) as outputs:
         context = RunContext(outputs, progress or NoProgress())
@@ -186,6 +188,11 @@ def run(
                         values[node.tag] = _turn(
                             node.stage, [values[tag] for tag in inputs[node.tag]], context
                         )
+                    for waiting in nodes:
+                        if waiting.stage.evidence and node.tag in made_by[waiting.tag]:
+                            _prepare(
+                                waiting.stage, [values.get(tag) for tag in made_by[waiting.tag]], context
+                            )
                     advance(1)
         # a run that fails and keeps no evidence leaves nothing
         keep = context.failure is None or any(stage.evidence for stage in stages)
@@ -216,16 +223,22 @@ def _facts(nodes: Sequence[Node], before: RunResult | None) -> RunFacts:
     )
 
 
-def _inputs_behind_late(nodes: Sequence[Node]) -> dict[str, tuple[str, ...]]:
-    """Return each stage's inputs, where a late stage is replaced by its own: it returns what it took."""
-    late = {node.tag for node in nodes if node.stage.late}
+def _inputs_behind(nodes: Sequence[Node], passes_on: Callable[[Stage], bool]) -> dict[str, tuple[str, ...]]:
+    """Return each stage's inputs, where a stage that hands on what it took is replaced by its own."""
+    passing = {node.tag for node in nodes if passes_on(node.stage)}
     inputs: dict[str, tuple[str, ...]] = {}
     for node in nodes:
         found: tuple[str, ...] = ()
         for tag in node.inputs:
-            found += inputs[tag] if tag in late else (tag,)
+            found += inputs[tag] if tag in passing else (tag,)
         inputs[node.tag] = found
     return inputs
+
+
+def _prepare(stage: Stage, inputs: Sequence[Value | None], context: RunContext) -> None:
+    known = [value for value in inputs if value is not None]
+    if len(known) == len(inputs):
+        stage.prepare(known, context)
 
 
 def _check(nodes: Sequence[Node], context: RunContext) -> None:

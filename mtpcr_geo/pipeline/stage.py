@@ -145,6 +145,13 @@ class Stage(ABC):
     def open(self, context: RunContext) -> None:  # noqa: B027 - most stages need nothing before their turn
         """Get ready before the first stage runs."""
 
+    def prepare(self, inputs: Sequence[Value], context: RunContext) -> None:  # noqa: B027
+        """Begin, in threads of its own, what needs its inputs alone, while the stages before it work.
+
+        It is called once all inputs are known, of evidence writers that are behind others before their turn:
+        those hand on what they took. Threads end with ``context.at_end``.
+        """
+
     def reads(self) -> list[Path]:
         """Files this stage reads, as named by its options."""
         return []

@@ -24,7 +24,11 @@ from mtpcr_geo.export.report.pictures import Overlay
 
 
 def write_report(
-    path: str | Path, pair: Pair, done: Sequence[Mapping[str, Any]], facts: Mapping[str, Any]
+    path: str | Path,
+    pair: Pair,
+    done: Sequence[Mapping[str, Any]],
+    facts: Mapping[str, Any],
+    pictures: Mapping[str, Any] | None = None,
 ) -> None:
     """Write the report of a run, whatever state the run ended in.
 
@@ -34,12 +38,14 @@ def write_report(
         done: one entry a finished stage: type, tag, options, seconds, metadata, skipped, failed.
         facts: what holds for the run: versions, inputs (path, bytes, sha256), the command line that
             started it (None where none did), and what it wrote (files, withheld, forced).
+        pictures: those of the pair, see `pictures_of`; drawn here if None.
 
     Raises:
         OutputError: if the file cannot be written.
 
     """
-    html = TEMPLATE.render(_content(pair, done, facts))
+    drawn = pictures_of(pair) if pictures is None else pictures
+    html = TEMPLATE.render({**_content(pair, done, facts), **drawn})
     try:
         Path(path).write_text(visible(html) + "\n", encoding="utf-8")
     except OSError as error:
@@ -47,7 +53,7 @@ def write_report(
 
 
 def _content(pair: Pair, done: Sequence[Mapping[str, Any]], facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the template shows."""
+    """Return what the template shows beside the pictures."""
     now = datetime.datetime.now(datetime.UTC)
     style, script = (_part(name) for name in ("style.css", "swipe.js"))
     written = facts.get("written")
@@ -85,12 +91,11 @@ def _content(pair: Pair, done: Sequence[Mapping[str, Any]], facts: Mapping[str, 
             *told.frame_rows(pair),
         ],
         "both_keys": figures.BOTH_KEYS,
-        **_pictures(pair),
     }
 
 
-def _pictures(pair: Pair) -> dict[str, Any]:
-    """Return the pictures and charts, as far as the run came."""
+def pictures_of(pair: Pair) -> dict[str, Any]:
+    """Return the pictures and charts of a report, by their names in it, as far as the run came."""
     both = pair.source.bev is not None and pair.target.bev is not None
     found: dict[str, Any] = dict.fromkeys(("zoom", "swipe", "difference"))
     found |= {"sections": (), "patches": (), "reliefs": ()}

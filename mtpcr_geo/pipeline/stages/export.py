@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -12,7 +13,7 @@ from pydantic import Field
 
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.recorder import LEAST_RECORDING_MB, RECORDING_MB, NullRecorder
-from mtpcr_geo.core.system import command_line, peak_memory_mb
+from mtpcr_geo.core.system import command_line, peak_memory_mb, usable_cores
 from mtpcr_geo.core.types import Pair, Side, Verdict
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.export.recording.budget import Budget
@@ -333,6 +334,14 @@ class WriteReport(EvidenceWriter):
     type = "mtpcr.write_report"
     needs: ClassVar[tuple[str, ...]] = ("mtpcr_geo.export.report.page",)
     late = True
+    _drawn: tuple[Pair, Future[dict[str, Any]]] | None = None
+
+    def prepare(self, inputs: Sequence[Value], context: RunContext) -> None:
+        """Begin to draw the pictures."""
+        if usable_cores() > 1 and len(inputs) == 1 and isinstance(inputs[0], Pair):
+            worker = ThreadPoolExecutor(1, thread_name_prefix="report")
+            context.at_end.callback(worker.shutdown, cancel_futures=True)
+            self._drawn = inputs[0], worker.submit(_pictures_of, inputs[0])
 
     def write(self, pair: Pair, context: RunContext) -> None:
         """Write the HTML."""
@@ -342,7 +351,15 @@ class WriteReport(EvidenceWriter):
         path = context.outputs.path(self.options.filename)
         written = Written.of(context.done, context.outputs.written())
         facts = {**context.facts.audit(), "written": written.audit(), "command": command_line()}
-        write_report(path, pair, done, facts)
+        begun = self._drawn
+        pictures = begun[1].result() if begun is not None and begun[0] is pair else None
+        write_report(path, pair, done, facts, pictures)
+
+
+def _pictures_of(pair: Pair) -> dict[str, Any]:
+    from mtpcr_geo.export.report.page import pictures_of
+
+    return pictures_of(pair)
 
 
 class WriteRun(EvidenceWriter):
