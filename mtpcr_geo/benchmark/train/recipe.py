@@ -179,5 +179,5 @@ def _computes_bfloat16() -> bool:
     """Return whether this processor has instructions for bfloat16; PyTorch imitates them where it has not."""
     import torch
 
-    told = getattr(torch.cpu, "get_capabilities", dict)()
+    told: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
     return bool(told.get("avx512_bf16") or told.get("amx_bf16"))
