@@ -2,8 +2,8 @@
 
     mtpcr-geo demo --overwrite && python docs/make_pictures.py mtpcr-demo
 
-Needs matplotlib and pyogrio (extra `test`). Without Chromium the picture of the report stays as it is. A
-picture taken in QGIS, of any size, takes the place of the layers drawn here with ``--qgis PICTURE``.
+Needs matplotlib and pyogrio (extra `test`). Without Chromium the picture of the report stays as it is, and without
+xvfb-run (Debian's xvfb, xauth and mesa-vulkan-drivers draw without a display) that of the recording. A picture taken in QGIS, of any size, takes the place of the layers drawn here with ``--qgis PICTURE``.
 """
 
 from __future__ import annotations
@@ -150,6 +150,13 @@ def report(page: Path, chromium: str, picture: Path) -> None:
         subprocess.run([*command, f"--user-data-dir={profile}"], check=True, capture_output=True, timeout=120)
 
 
+def recording(file: Path, picture: Path) -> None:
+    """Take a picture of a recording as the viewer opens it, on a display that is not there."""
+    screen = ["xvfb-run", "-a", "-s", "-screen 0 1600x1000x24"]
+    viewer = ["rerun", "--renderer", "vulkan", "--window-size", "1400x860", "--screenshot-to", str(picture)]
+    subprocess.run([*screen, *viewer, str(file)], check=True, capture_output=True, timeout=300)
+
+
 def main() -> None:
     """Make every picture."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -171,6 +178,10 @@ def main() -> None:
     if chromium:
         picture = arguments.images / "report.png"
         report(arguments.demo / "result" / "report.html", chromium, picture.resolve())
+        smaller(picture)
+    if shutil.which("xvfb-run"):
+        picture = arguments.images / "recording.png"
+        recording(arguments.demo / "result" / "audit.rrd", picture.resolve())
         smaller(picture)
 
 

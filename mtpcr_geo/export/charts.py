@@ -143,8 +143,11 @@ def residual_map(
         ends = place(target[:, :2] + residual * cut[:, None] * enlarged)
         for (x, y), (u, v), colour in zip(xy, ends, colours, strict=True):
             drawn.append(_arrow(x, y, u, v, _css(colour), dot))
+    # a colour near the paper's is seen by its rim
+    drawn.append('<g stroke="#6b7782" stroke-width="0.75">')
     for (x, y), colour in zip(xy, colours, strict=True):
         drawn.append(f'<circle cx="{x:.0f}" cy="{y:.0f}" r="{dot:.1f}" fill="{_css(colour)}"/>')
+    drawn.append("</g>")
     svg = (
         f'<svg viewBox="0 0 {_MAP_SIDE:.0f} {height:.0f}" aria-hidden="true" focusable="false">'
         f"{''.join(drawn)}</svg>"
