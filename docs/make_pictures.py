@@ -2,8 +2,9 @@
 
     mtpcr-geo demo --overwrite && python docs/make_pictures.py mtpcr-demo
 
-Needs matplotlib and pyogrio (extra `test`). Without Chromium the picture of the report stays as it is, and without
-xvfb-run (Debian's xvfb, xauth and mesa-vulkan-drivers draw without a display) that of the recording. A picture taken in QGIS, of any size, takes the place of the layers drawn here with ``--qgis PICTURE``.
+Needs matplotlib and pyogrio (extra `test`). Without Chromium the picture of the report stays as it is, and
+without xvfb-run that of the recording (Debian's xvfb, xauth and mesa-vulkan-drivers draw without a display).
+A picture taken in QGIS, of any size, takes the place of the layers drawn here with ``--qgis PICTURE``.
 """
 
 from __future__ import annotations
