@@ -172,12 +172,16 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
         if trained_on is None
         else SolveOptions(tries=MANY_TRIES, seed=seed)
     )
-    # matches of few keypoints leave height and tilt too rough for point-to-point ICP alone
-    refine = RefineOptions(
-        method="point_to_point",
-        ground=trained_on is not None,
-        max_correspondence_distance=[3.0, 1.5, 0.75],
-        keep_tie_points=0,
+    # tie points of a small network are off by a cell or two, and point-to-point ICP stops short from there
+    refine = (
+        RefineOptions(
+            method="point_to_point",
+            ground=False,
+            max_correspondence_distance=[3.0, 1.5, 0.75],
+            keep_tie_points=0,
+        )
+        if trained_on is None
+        else RefineOptions(feedback=False)
     )
     steps: list[Stage] = [
         MakeBev(bev, f"{prefix}bev"),
