@@ -14,11 +14,15 @@ import pytest
 from helpers_scene import ICP_RESULT, make_pair, rasterise
 
 from mtpcr_geo.core.errors import OutputError
+from mtpcr_geo.core.progress import NoProgress
 from mtpcr_geo.core.types import Check, Verdict
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.export import charts, descriptions, drawing
 from mtpcr_geo.export.report.page import write_report
 from mtpcr_geo.export.report.shown import ticks
+from mtpcr_geo.io.outputs import OutputSet
+from mtpcr_geo.pipeline.stage import RunContext
+from mtpcr_geo.pipeline.stages.export import FileOptions, WriteReport
 
 DONE = [
     {"type": "mtpcr.level", "tag": "level", "options": {"method": "auto"}, "seconds": 0.5, "metadata": {}},
@@ -320,3 +324,21 @@ def test_report_says_which_refinement_was_taken_and_why() -> None:
     assert "surfaces met worse" in descriptions.refinement_text(kept)
     assert "lost the tie points" in descriptions.refinement_text(replace(kept, lost_tie_points=True))
     assert ("refined by", followed) in descriptions.transform_rows(make_pair(500))
+
+
+def test_pictures_begun_ahead_are_those_of_the_pair_that_is_written(tmp_path):
+    first, other = make_pair(20_000), make_pair(30_000)
+    pages = []
+    for begun_with in (other, first, None):
+        path = tmp_path / f"{len(pages)}.html"
+        with OutputSet(overwrite=True) as outputs:
+            context = RunContext(outputs, NoProgress())
+            stage = WriteReport(FileOptions(filename=path), "report")
+            if begun_with is not None:
+                stage.prepare([begun_with], context)
+            stage.write(other, context)
+            context.close()
+            outputs.commit()
+        pages.append(re.findall(r'src="data:[^"]+"', path.read_text()))
+    assert pages[0]
+    assert pages[0] == pages[1] == pages[2]
