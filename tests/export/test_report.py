@@ -328,7 +328,7 @@ def test_report_says_which_refinement_was_taken_and_why() -> None:
 
 def test_pictures_begun_ahead_are_those_of_the_pair_that_is_written(tmp_path):
     first, other = make_pair(20_000), make_pair(30_000)
-    pages = []
+    pages: list[list[str]] = []
     for begun_with in (other, first, None):
         path = tmp_path / f"{len(pages)}.html"
         with OutputSet(overwrite=True) as outputs:
