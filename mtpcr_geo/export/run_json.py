@@ -328,6 +328,8 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.refine icp.rotated_deg``: angle by which ICP turned the start
 - ``mtpcr.refine slid_m``: how far ICP had gone in plan from the tie points of a scene that repeats itself,
   where that was too far and plan and yaw were left as the tie points have them
+- ``mtpcr.refine from_search``: whether the pose of the search was refined in place of what the tie points led
+  to, since surfaces met better there
 - ``mtpcr.refine levelled_again``: whether the source was levelled by the vertical that ICP found, matched and
   solved again; then the figures are those of the second refinement
 - ``mtpcr.refine matched_again_cell_m``: where surfaces met better beside the tie points, and new tie points

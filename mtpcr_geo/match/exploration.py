@@ -17,8 +17,8 @@ from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.pyramid import Level, Pyramid
 from mtpcr_geo.match.repetition import REPEATS, self_likeness
 from mtpcr_geo.match.search import GlobalSearch, Layer, all_yaws, distinct
-from mtpcr_geo.match.terrain import FEWEST_CELLS as FEWEST_GROUND_CELLS
-from mtpcr_geo.match.terrain import Terrain, TerrainSearch, cell_to_compare, closest, place_on
+from mtpcr_geo.match.terrain import Terrain, cell_to_compare
+from mtpcr_geo.match.terrain_search import propose
 from mtpcr_geo.method.ground import bare
 from mtpcr_geo.method.scales import Scales
 
@@ -29,8 +29,6 @@ HYPOTHESES, MORE_HYPOTHESES = 10, 48
 """Hypotheses of a level followed at first, and at most where these do not convince: a small source has more
 places to lie in a large target, and each costs less to follow."""
 TERRAIN_HYPOTHESES, MORE_TERRAIN_HYPOTHESES = 6, 16
-SETTLED_BY_TERRAIN = 40
-"""Poses that the terrains propose, of which those are followed under which they are closest."""
 MIRRORED_HYPOTHESES = 24
 """Hypotheses of a level of the mirrored search followed at first: where a scene repeats itself many score
 alike, and the best of them must be met."""
@@ -230,10 +228,14 @@ class Exploration:
     def _by_terrain(self, step: Step) -> tuple[list[Pose], float]:
         """Return what the terrains propose, at the finest cells, without what the channels had proposed."""
         share, count = (2, MORE_TERRAIN_HYPOTHESES) if step.part else (1, TERRAIN_HYPOTHESES)
-        proposed = self._propose_by_terrain(
-            self.scales.terrain_cell_m / share, count, COARSEST_YAW_STEP_DEG / share
-        )
-        return self._nearby(step.factor, self._others(proposed)), 0.0
+        cell_m = self.scales.terrain_cell_m / share
+        proposed = self._propose_by_terrain(cell_m, count, COARSEST_YAW_STEP_DEG / share)
+        if step.part:
+            more = self._propose_by_terrain(cell_m, TERRAIN_HYPOTHESES, COARSEST_YAW_STEP_DEG, robustly=True)
+            proposed = distinct([*proposed, *more], len(proposed) + len(more), np.radians(1.0), cell_m / 2)
+        others = self._others(proposed)
+        # where crowns of other years fit better a few metres off, the ground knows the place
+        return [*others, *self._nearby(step.factor, others)], 0.0
 
     def _by_proposals(self, step: Step) -> list[Pose]:
         """Return what others propose, at the finest cells, without what the channels had proposed."""
@@ -404,32 +406,22 @@ class Exploration:
         poses = search.run(yaws, PEAKS_A_YAW, 4, self.advance)
         return distinct(poses, self.most, 2 * step, 5 * cell)
 
-    def _propose_by_terrain(self, cell_m: float, count: int, step_deg: float) -> list[Pose]:
-        """Propose poses, about the finest centre, under which the grounds have the same shape.
-
-        Args:
-            cell_m: cell in which they are compared, metres.
-            count: how many to propose at most.
-            step_deg: step over all yaws.
-
-        """
-        source, target = (Terrain.of(bev, max(cell_m, self.scales.cell_m)) for bev in self.bare)
-        cell, prior = source.grid.cell, self.prior
-        reached = target if prior is None else prior.terrain(source.grid, target)
-        if reached is None or min(source.mask.sum(), reached.mask.sum()) < 4 * FEWEST_GROUND_CELLS:
-            return []
-        step = float(np.radians(step_deg))
-        yaws = np.arange(round(2 * np.pi / step)) * step
-        search = TerrainSearch(source, reached, max(self._least_m2 / cell**2, FEWEST_GROUND_CELLS))
-        if prior is not None:
-            yaws = prior.yaws(step)
-            place = prior.place_of(source.grid)
-            if place is not None:
-                search.restrict(place, prior.radius_m)
-        found = distinct(search.run(yaws), SETTLED_BY_TERRAIN, 2 * step, 3 * cell)
-        found = closest(source, target, found, count, plane=not self.settings.trust_vertical)
-        grid = self.pyramid.at(1)[0].grid
-        return [place_on(pose, source, grid) for pose in found]
+    def _propose_by_terrain(
+        self, cell_m: float, count: int, step_deg: float, *, robustly: bool = False
+    ) -> list[Pose]:
+        """Propose poses, about the finest centre, under which the grounds have the same shape."""
+        found = propose(
+            self.bare,
+            max(cell_m, self.scales.cell_m),
+            count,
+            step_deg,
+            least_m2=self._least_m2,
+            prior=self.prior,
+            plane=not self.settings.trust_vertical,
+            robustly=robustly,
+        )
+        centre = centre_of(self.pyramid.at(1)[0].grid)
+        return [pose_of(one, centre) for one in found]
 
     def _on_level(self, factor: int, poses: list[Pose]) -> list[Pose]:
         """Express poses about the finest centre as poses about that of a level."""

@@ -35,6 +35,8 @@ RARE = {
     # where a vertical that levelling found was corrected
     "mtpcr.refine levelled_again",
     "mtpcr.refine tilt_deg",
+    # where tie points led elsewhere than the search
+    "mtpcr.refine from_search",
     # where surfaces and tie points contradicted each other
     "mtpcr.refine matched_again_cell_m",
     # of matchers that describe all places

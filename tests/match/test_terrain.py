@@ -14,13 +14,10 @@ from mtpcr_geo.match.search import angle_between
 from mtpcr_geo.match.terrain import (
     FEWEST_CELLS,
     Terrain,
-    TerrainSearch,
     cell_to_compare,
-    closest,
     compare_ground,
-    place_on,
-    settle,
 )
+from mtpcr_geo.match.terrain_search import TerrainSearch, closest, propose, settle
 from mtpcr_geo.method.bev import grid_around, rasterise
 
 CELL = 4.0
@@ -128,7 +125,10 @@ def test_a_pose_reads_the_same_about_another_centre(source: np.ndarray, target: 
     s, t = terrain_of(source), terrain_of(target)
     best, _ = best_of(s, t)
     grid = grid_around(np.array([400.0, -300.0]), np.array([433.0, -278.0]), 1.0)
-    a, b = best.hypothesis(centre_of(s.grid)), place_on(best, s, grid).hypothesis(centre_of(grid))
+    a, b = (
+        best.hypothesis(centre_of(s.grid)),
+        pose_of(best.hypothesis(centre_of(s.grid)), centre_of(grid)).hypothesis(centre_of(grid)),
+    )
     assert np.allclose(a.shift, b.shift)
     assert a.yaw == b.yaw
 
@@ -243,6 +243,53 @@ def test_poses_far_from_any_ground_stay_where_they_are(source, target) -> None:
     away = Pose(0.3, 5000.0, 5000.0)
     assert settle(s, t, away) == away
     assert closest(s, t, [away], 3) == []
+
+
+def brushed(xyz: np.ndarray, seed: int) -> np.ndarray:
+    """The cloud with brush that hides the ground on four tenths of it, 0.5 to 4 m high."""
+    rng = np.random.default_rng(seed)
+    low, high = transforms.bounds(xyz)
+    out = xyz.copy()
+    hidden = np.zeros(len(xyz), bool)
+    while hidden.mean() < 0.4:
+        inside = np.hypot(*(xyz[:, :2] - rng.uniform(low[:2], high[:2])).T) < rng.uniform(2.0, 4.5)
+        out[inside, 2] = np.maximum(out[inside, 2], xyz[inside, 2] + rng.uniform(0.5, 4.0))
+        hidden |= inside
+    return out
+
+
+def test_brush_does_not_hide_the_shape_of_the_ground() -> None:
+    # gentle terrain: brush differs by more than the ground does
+    s = bev_of(brushed(transforms.apply(T_MOVED, ground(2, (-40.0, -30.0), (40.0, 60.0), 0.15)), 5))
+    t = bev_of(brushed(ground(1, (-100.0, -100.0), (100.0, 100.0), 0.15), 6))
+    true = pose_of(TRUE, centre_of(s.grid))
+    ranks = []
+    for robustly in (False, True):
+        found = [
+            pose_of(one, centre_of(s.grid))
+            for one in propose((s, t), CELL, 6, 4.0, least_m2=2000.0, robustly=robustly)
+        ]
+        near = [
+            np.hypot(one.east - true.east, one.north - true.north) < CELL
+            and angle_between(one.yaw, true.yaw) < np.radians(3.0)
+            for one in found
+        ]
+        ranks.append(near.index(True) if any(near) else None)
+    assert ranks[1] == 0, ranks
+    assert ranks[0] != 0, "the test is of something that sums of squares do not find"
+
+
+def test_medians_leave_out_single_cells_and_make_none_up() -> None:
+    s = terrain_of(ground(3, (0.0, 0.0), (80.0, 80.0), 0.1))
+    low, mask = s.low.copy(), s.mask.copy()
+    low[10, 10] += 5.0
+    mask[3:9, 3:9] = 0.0
+    mask[6, 6] = 1.0
+    smooth = replace(s, low=low, mask=mask).smoothed()
+    assert abs(smooth.low[10, 10] - s.low[10, 10]) < 0.3
+    assert (smooth.mask <= mask).all()
+    assert smooth.mask[6, 6] == 0.0
+    assert (smooth.low[smooth.mask == 0] == 0.0).all()
 
 
 def test_the_closest_grounds_come_first_though_others_share_more(target) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.types import Refinement
+from mtpcr_geo.core.fits import IcpResult, IcpTrial, Refinement
 from mtpcr_geo.method.held import held_to_tie_points
 
 PIVOT = np.array([120.0, -40.0, 8.0])
@@ -39,3 +39,16 @@ def test_plan_and_yaw_go_back_and_height_and_tilt_stay(R_level: np.ndarray) -> N
 def test_what_stays_near_the_tie_points_is_left_as_it_is() -> None:
     found = refined(0.2, 0.3, 1.5, 3.0)
     assert held_to_tie_points(found, PIVOT, np.eye(3), 0.25) is found
+
+
+@pytest.mark.parametrize(("after", "held"), [(0.20, True), (0.18, True), (0.12, False)])
+def test_surfaces_that_meet_clearly_better_have_not_slid(after: float, held: bool) -> None:
+    found = refined(0.7, 0.3, 1.5, 0.2)
+    tried = {
+        "tie_points": IcpTrial(0.22, 9),
+        "ground": IcpTrial(0.20, 9),
+        "near": IcpTrial(after, 9),
+    }
+    icp = IcpResult(found.T, "gicp", 0.5, 900, 900, tried, "near", followed=True, lost_tie_points=False)
+    found = Refinement(found.T, found.T_before, icp=icp)
+    assert (held_to_tie_points(found, PIVOT, np.eye(3), 0.25).slid_m is not None) is held

@@ -15,7 +15,7 @@ from mtpcr_geo.core.types import Bev, Pair, Side
 from mtpcr_geo.export.descriptions import transform_rows
 from mtpcr_geo.method.bev import make_bev
 from mtpcr_geo.method.refine import RefineSettings, refine
-from mtpcr_geo.pipeline.stages.feedback import CLOSER, borne_out, matched_coarser
+from mtpcr_geo.pipeline.stages.feedback import CLOSER, borne_out, matched_coarser, refined_from_search
 from mtpcr_geo.verdict.evidence import tie_points_agreeing
 
 
@@ -85,6 +85,34 @@ def beside(pair: Pair, T: np.ndarray, by: tuple[float, float, float]) -> tuple[P
 
 def raster(side: Side, cell: float) -> Bev:
     return make_bev(side.levelled_sample, cell)
+
+
+def test_the_pose_of_the_search_is_refined_where_tie_points_lead_elsewhere(registered) -> None:
+    pair, T = registered
+    off, refined = beside(pair, T, (3.0, 2.0, 0.5))
+    found = refined_from_search(off, refined, RefineSettings())
+    assert found is not None
+    assert found.again is not None
+    places = transforms.apply(transforms.inverse(T), np.array([[40.0, 40.0, 0.0], [-40.0, -40.0, 0.0]]))
+    apart = transforms.apply(found.T, places) - transforms.apply(T, places)
+    assert np.abs(apart).max() < 0.03
+
+
+def test_the_pose_of_the_search_stays_out_where_it_is_the_same_or_surfaces_meet_no_better(registered) -> None:
+    pair, T = registered
+    right, refined = beside(pair, T, (0.0, 0.0, 0.0))
+    assert refined_from_search(right, refined, RefineSettings()) is None
+    assert right.matches is not None
+    first, *others = right.matches.hypotheses
+    # from 5 m off ICP comes to the same place, from 17 m to a worse one
+    for east, north in ((4.0, -3.0), (8.0, -15.0)):
+        wrong = replace(first, shift=(first.shift[0] + east, first.shift[1] + north))
+        misled = right.with_(matches=replace(right.matches, hypotheses=(wrong, *others)))
+        assert refined_from_search(misled, refined, RefineSettings()) is None
+    # nor where nothing was asked of the surfaces
+    off, refined = beside(pair, T, (3.0, 2.0, 0.5))
+    for settings in (RefineSettings(method=None), RefineSettings(ground=False)):
+        assert refined_from_search(off, refined, settings) is None
 
 
 def test_tie_points_beside_the_surfaces_are_sought_again_at_coarser_cells(registered) -> None:

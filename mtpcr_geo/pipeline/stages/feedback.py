@@ -8,7 +8,7 @@ what they lie on: tie points then agree a cell or two beside the truth, and thos
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -170,21 +170,76 @@ def matched_coarser(
     return again.with_(T_target_source=refinement.T, refinement=replace(refinement, again=why))
 
 
+def refined_from_search(pair: Pair, refined: Refinement, settings: RefineSettings) -> Refinement | None:
+    """Refine from the pose that the search had judged, where the tie points led elsewhere.
+
+    The search judges a pose by all patches and by both grounds. Where few patches agree, as in woods of two
+    years, those that do may agree by chance, and the transform solved from them lies metres off.
+
+    Args:
+        pair: solved, with matches.
+        refined: what the refinement of the solved transform came to.
+        settings: of the refinement.
+
+    Returns:
+        The refinement from there, or None where it is the same place, or the surfaces meet no better.
+
+    """
+    matches, tie_points, solved = pair.matches, pair.tie_points, pair.T_target_source
+    if matches is None or tie_points is None or solved is None:
+        return None
+    if not matches.hypotheses or not len(tie_points):
+        return None
+    if settings.method is None or not settings.ground or settings.keep_tie_points == 0:
+        return None
+    judged = matches.hypotheses[0]
+    T_level = transforms.compose(transforms.yaw_matrix(judged.yaw), np.array([*judged.shift, 0.0]))
+    places, judged_places = (transforms.apply(T, tie_points.source) for T in (pair.levelled(solved), T_level))
+    step = places - judged_places
+    if float(np.hypot(step[:, 0], step[:, 1]).mean()) <= tolerance_for(pair.cell):
+        return None
+    T_level = transforms.translation((0.0, 0.0, float(step[:, 2].mean()))) @ T_level
+    T = transforms.inverse(pair.target.T_level_work) @ T_level @ pair.source.T_level_work
+    try:
+        refinement = _refined(pair.with_(T_target_source=T), settings)
+    except RegistrationError:
+        return None  # a second opinion never costs the first
+    both = refined.T, refinement.T
+    if _apart_m(pair, *both) <= tolerance_for(pair.cell):
+        return None  # both led to one place
+    if not all(later < first for first, later in (_met(pair, about, both, settings) for about in both)):
+        return None
+    why = "refined from the pose of the search: surfaces met better there than where the tie points led"
+    return replace(refinement, again=why)
+
+
 def _meet_better(pair: Pair, before: Floats, after: Floats, settings: RefineSettings) -> bool:
     """Return whether the same surfaces, those of the overlap before, meet clearly better after."""
+    first, later = _met(pair, before, (before, after), settings)
+    return later <= BETTER * first
+
+
+def _met(pair: Pair, about: Floats, those: Sequence[Floats], settings: RefineSettings) -> list[float]:
+    """Return how far surfaces, those of the overlap under one transform, are from meeting under others.
+
+    NaN where there are none.
+    """
     distance = max(max(one.max_correspondence_distances_m) for one in rounds_for(pair.cell).values())
+    clouds = pair.source.sample, pair.target.sample
+    if len(clouds[0]) > len(clouds[1]):
+        # the smaller cloud moves, as in the refinement, so that source and target exchanged say the same
+        clouds, about, those = clouds[::-1], transforms.inverse(about), [*map(transforms.inverse, those)]
     try:
         surfaces = Surfaces(
-            pair.source.sample,
-            pair.target.sample,
-            before,
+            *clouds,
+            about,
             voxel_m=settings.voxel_m,
             max_correspondence_distance_m=distance,
             max_points=settings.max_points,
         )
     except RegistrationError:
-        return False  # a second opinion never costs the first
-    return surfaces.surface_residual(after) <= BETTER * surfaces.surface_residual(before)
+        return [np.nan] * len(those)
+    return [surfaces.surface_residual(T) for T in those]
 
 
 def _apart_m(pair: Pair, A: Floats, B: Floats) -> float:

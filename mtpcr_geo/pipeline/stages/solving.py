@@ -155,7 +155,8 @@ class RefineOptions(StageOptions):
     feedback: bool = Field(
         True,
         description="match and solve again once where a vertical is not known and ICP tilts the source, "
-        "levelled by that; or where surfaces fit better beside the tie points, at a coarser cell",
+        "levelled by that; or where surfaces fit better beside the tie points, at a coarser cell; refine "
+        "from the pose of the search too where tie points led elsewhere",
     )
     keep_tie_points: float = Field(
         0.5,
@@ -182,7 +183,7 @@ class Refine(Stage):
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Refine the solved transform."""
         from mtpcr_geo.method.refine import RefineSettings, refine
-        from mtpcr_geo.pipeline.stages.feedback import fed_back, matched_coarser
+        from mtpcr_geo.pipeline.stages.feedback import fed_back, matched_coarser, refined_from_search
         from mtpcr_geo.pipeline.stages.rasters import rasterised
         from mtpcr_geo.verdict.evidence import tie_points_agreeing
 
@@ -216,6 +217,11 @@ class Refine(Stage):
         def raster_at(side: Side, cell: float) -> Bev:
             return rasterised(side, cell, "centre", context)
 
+        if options.feedback:
+            elsewhere = refined_from_search(pair, refinement, settings)
+            if elsewhere is not None:
+                pair, refinement = pair.with_(T_target_source=elsewhere.T_before), elsewhere
+                self.metadata["from_search"] = True
         trusted = pair.source.levelling.trusted and pair.target.levelling.trusted
         if not trusted and options.feedback:
             again = fed_back(pair, refinement, settings, raster_at)
