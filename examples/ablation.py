@@ -6,7 +6,10 @@ DATA holds a folder for each pair, as for benchmark_matchers.py. Every start tur
 degrees and shifts it by up to 100 m, as in the paper; the clouds stand upright, so levelling takes no part.
 Steps are those of ``register --profile paper``; with ``--robust`` the SVD starts from the yaw and shift that
 most tie points agree on, since one SVD over many outliers does not recover, whatever the image. With
-``--band-pass`` enhancement means our band-passed heights in place of the paper's two filters.
+``--band-pass`` enhancement means our band-passed heights in place of the paper's two filters. The profile
+gives ``--matcher bev`` the image and the cells that it was trained on: its RES chooses one cell for both
+clouds by their density, against 1 m without, and its enhancement is the band pass. With ``--printed`` it gets
+the paper's cells (Eq. 1) and filters (Eq. 3 and 4) too.
 """
 
 from __future__ import annotations
@@ -43,6 +46,11 @@ def main() -> None:
         "--robust", action="store_true", help="start the SVD from what most tie points agree on"
     )
     parser.add_argument("--band-pass", action="store_true", help="band-passed heights as enhancement")
+    parser.add_argument(
+        "--printed",
+        action="store_true",
+        help="the paper's cells and filters, whatever the matcher was trained on",
+    )
     options = parser.parse_args()
     try:
         for folder in (f for data in options.data for f in pair_folders(data, tuple(options.only))):
@@ -72,8 +80,12 @@ def ablated(pair: BenchmarkPair, options: argparse.Namespace) -> str:
             for step in steps:
                 if step["type"] == "mtpcr.solve" and options.robust:
                     step |= {"robust_start": True, "upright": True, "tries": 20_000}
-                if step["type"] == "mtpcr.enhance" and options.band_pass and enhance:
+                if step["type"] == "mtpcr.enhance" and enhance and options.band_pass:
                     step["look"] = "band_pass"
+                if step["type"] == "mtpcr.enhance" and enhance and options.printed:
+                    step["look"] = "paper"
+                if step["type"] == "mtpcr.bev" and res and options.printed:
+                    step["resolution"] = "eq1"
             done = follow(levelled, steps)
             T = TransformChain.of(done.pair).T_file if done.pair.T_target_source is not None else None
             found = done.pair.matches.report if done.pair.matches is not None else {}
@@ -88,9 +100,11 @@ def ablated(pair: BenchmarkPair, options: argparse.Namespace) -> str:
                 row |= {"e_r": errors.rotation_deg, "e_t": errors.translation_m, "rmsd": errors.rmsd_m}
                 row["right"] = errors.within()
             rows.setdefault((res, focus, enhance), []).append(row)
+    said = {"robust start": options.robust, "band-passed": options.band_pass, "as printed": options.printed}
     lines = [
-        f"{pair.name}, {options.matcher}, {options.starts} starts"
-        f"{', robust start' if options.robust else ''}{', band-passed' if options.band_pass else ''}",
+        ", ".join(
+            [pair.name, options.matcher, f"{options.starts} starts", *(k for k, on in said.items() if on)]
+        ),
         f"{'RES':>5}{'FOCUS':>7}{'IE':>5}{'success':>9}{'e_r deg':>10}{'e_t m':>10}{'RMSD m':>10}"
         f"{'matches':>9}{'agreeing':>10}{'s':>7}",
     ]

@@ -19,7 +19,7 @@ from mtpcr_geo.benchmark.train.recipe import Recipe, train
 from mtpcr_geo.benchmark.train.sites import FIRST_SEED, Site, kind_of, site
 from mtpcr_geo.benchmark.train.views import View, views_of
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.errors import MissingPartError
+from mtpcr_geo.core.errors import MissingPartError, OptionError
 
 TINY = Recipe(
     sites=1, draws=2, feature_steps=12, batch=2, size=64, width=16, matcher_pairs=6, matcher_epochs=2,
@@ -181,6 +181,12 @@ def test_a_site_is_simulated_once_and_kept(tmp_path):
     cells = [{tuple(cell) for cell in (points[:, :2] // 2).astype(int)} for points in made.clouds.values()]
     assert all(len(cells[0] & other) > 0.2 * min(len(cells[0]), len(other)) for other in cells[1:])
     assert transforms.bounds(made.clouds["uav"].astype(float))[1][2] < 100.0
+
+
+@pytest.mark.parametrize(("name", "word"), [("precision", "float16"), ("device", "gpu")])
+def test_words_that_a_recipe_does_not_know_are_refused(name: str, word: str):
+    with pytest.raises(OptionError, match=f"{name} is '{word}'; it is one of auto"):
+        Recipe(**{name: word})
 
 
 def test_command_names_its_options():

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 from mtpcr_geo.benchmark.train.sites import site
 from mtpcr_geo.benchmark.train.views import View, views_of
-from mtpcr_geo.core.errors import MissingPartError
+from mtpcr_geo.core.errors import MissingPartError, OptionError
 from mtpcr_geo.core.system import sha256
 
 
@@ -37,6 +37,9 @@ class Recipe:
         device: "auto", "cpu" or "cuda".
         precision: "float32", or "bfloat16" for the network's arithmetic, which takes half the time where
             processors have it and ten times as long where they do not; "auto" takes it where they do.
+
+    Raises:
+        OptionError: if device or precision is none of these.
 
     """
 
@@ -71,6 +74,16 @@ class Recipe:
         "device": "auto, cpu or cuda",
         "precision": "auto, float32 or bfloat16",
     }
+    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {
+        "device": ("auto", "cpu", "cuda"),
+        "precision": ("auto", "float32", "bfloat16"),
+    }
+
+    def __post_init__(self) -> None:
+        """Check the words."""
+        for name, known in self.CHOICES.items():
+            if getattr(self, name) not in known:
+                raise OptionError(f"{name} is {getattr(self, name)!r}; it is one of {', '.join(known)}")
 
 
 def train(
