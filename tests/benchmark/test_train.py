@@ -7,6 +7,7 @@ import subprocess
 import sys
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -185,8 +186,9 @@ def test_a_site_is_simulated_once_and_kept(tmp_path):
 
 @pytest.mark.parametrize(("name", "word"), [("precision", "float16"), ("device", "gpu")])
 def test_words_that_a_recipe_does_not_know_are_refused(name: str, word: str):
+    given: dict[str, Any] = {name: word}
     with pytest.raises(OptionError, match=f"{name} is '{word}'; it is one of auto"):
-        Recipe(**{name: word})
+        Recipe(**given)
 
 
 def test_command_names_its_options():
