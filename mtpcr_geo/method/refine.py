@@ -44,6 +44,10 @@ UPRIGHT = 1e-9
 CLEARLY = 1.01
 """Times that the residual after ICP must exceed a start's for the start to be taken: on bare, sparse ground
 they are equal but for chance, and results would jump with it."""
+FEW_TIE_POINTS, FAR_BETTER = 20, 0.7
+"""Tie points below which ICP is followed though it loses them, and the share of the starts' residual that it
+leaves then at most. It left 0.55 to 0.61 on four small discs, where 2 to 9 tie points agreed 2.5 to 3.8 m
+off, and was right to 0.1 to 0.6 m; among rows, where it may slide by a period, 0.85 to 1.00."""
 MUCH = 0.9
 """Share of the residual of a run of ICP that kept the tie points, below which another that lost them is told:
 along rows of trees or panels a far run ends a period away, and fits as well there or a little better."""
@@ -279,7 +283,7 @@ def follow_icp(
     A far one catches starts that are off by metres, but on open ground it lets the clouds slide; a near
     one does not. Neither is right where crops or bushes grew between the surveys and hold the least squares
     off the ground, which `Surfaces.surface_residual` sees through. In plan only the tie points have seen
-    anything on open ground, so what loses them is not followed.
+    anything on open ground: what loses them is not followed, unless few agreed and surfaces meet far better.
 
     Args:
         surfaces: of both clouds.
@@ -305,9 +309,15 @@ def follow_icp(
     if len(runs) == 2:
         # sparse clouds leave ICP several places to end in, and which of them fits best is luck
         tried[BETWEEN] = surfaces.between(*(run.T for run in runs.values()))
-    wanted = keep_tie_points * agreeing(starts[last])
+    agreed = agreeing(starts[last])
     trials = {name: IcpTrial(surfaces.surface_residual(T), agreeing(T)) for name, T in tried.items()}
-    kept = [name for name in tried if name == last or trials[name].tie_points >= wanted]
+    before = min((trials[name].surface_residual for name in starts if name in trials), default=0.0)
+    wanted, enough = keep_tie_points * agreed, FAR_BETTER * before if agreed < FEW_TIE_POINTS else 0.0
+    kept = [
+        name
+        for name, trial in trials.items()
+        if name == last or trial.tie_points >= wanted or trial.surface_residual <= enough
+    ]
     best = min(
         (name for name in kept if name != BETWEEN),
         key=lambda name: trials[name].surface_residual * (1.0 if name in runs else CLEARLY),

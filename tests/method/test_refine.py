@@ -179,29 +179,53 @@ def test_crops_that_lead_icp_off_the_ground_are_seen_through() -> None:
     assert not found.lost_tie_points
 
 
-@pytest.mark.parametrize("keep_tie_points", [0.5, 0.0])
-def test_icp_that_loses_the_ties_is_followed_only_where_that_is_asked(clouds, keep_tie_points: float) -> None:
+@pytest.mark.parametrize(
+    ("count", "keep_tie_points", "followed"),
+    [(60, 0.5, False), (8, 0.5, True), (60, 0.0, True), (8, 0.0, True)],
+)
+def test_icp_that_loses_the_ties_is_followed_where_that_is_asked_or_few_agreed(
+    clouds, count: int, keep_tie_points: float, followed: bool
+) -> None:
     pair = level_pair(clouds[0], clouds[1], "none")
     aside = off_by(0.0, (2.2, -1.2, 0.0))
     rng = np.random.default_rng(2)
-    place = rng.uniform(-40, 40, (60, 3)) * [1, 1, 0]
+    place = rng.uniform(-40, 40, (count, 3)) * [1, 1, 0]
+    fold = np.arange(count) % 4
     # tie points that agree on a pose from which ICP goes away, to where the clouds fit
     tie_points = TiePoints(
-        place, transforms.apply(aside, place), np.ones(60), np.arange(60) % 4, np.arange(60) % 4 == 0,
-        np.ones(60, bool),
-    )  # fmt: skip
+        place, transforms.apply(aside, place), np.ones(count), fold, fold == 0, np.ones(count, bool)
+    )
     pair = pair.with_(tie_points=tie_points, T_target_source=aside)
     step = {"type": "mtpcr.refine", "tag": "refine", "keep_tie_points": keep_tie_points}
     refined = follow(pair, [step]).pair
-    followed = keep_tie_points == 0.0
     assert refined.T_target_source is not None
     assert refined.refinement is not None
     assert refined.refinement.icp is not None
     assert refined.refinement.icp.followed is followed
     assert refined.refinement.icp.lost_tie_points is not followed
-    assert tie_points_agreeing(refined, refined.T_target_source) == (0 if followed else 60)
+    assert tie_points_agreeing(refined, refined.T_target_source) == (0 if followed else count)
     plan = np.linalg.norm(refined.T_target_source[:2, 3])
     assert plan < 0.05 if followed else plan == pytest.approx(np.hypot(2.2, 1.2), abs=0.05)
+
+
+def test_few_tie_points_are_kept_where_surfaces_meet_as_well_anywhere() -> None:
+    rng = np.random.default_rng(11)
+
+    def rows(n: int) -> np.ndarray:
+        """Walls of the same height every 3 m on flat ground."""
+        xy = rng.uniform(-40.0, 40.0, (n, 2))
+        wall = np.abs(xy[:, 1] - 3.0 * np.round(xy[:, 1] / 3.0)) < 0.3
+        return np.column_stack([xy, np.where(wall, rng.uniform(0.0, 1.8, n), rng.normal(0.0, 0.02, n))])
+
+    source, target = rows(60_000), rows(60_000)
+    found = follow_icp(
+        Surfaces(source, target, np.eye(4)),
+        {"tie_points": np.eye(4)},
+        rounds={"far": Rounds((3.0, 1.5)), "near": Rounds((1.0, 0.5))},
+        agreeing=lambda T: 8 if np.hypot(*T[:2, 3]) < 0.05 else 0,
+        keep_tie_points=0.5,
+    )
+    assert np.hypot(*found.T[:2, 3]) < 0.05
 
 
 def test_way_from_the_ties_is_measured_in_plan() -> None:

@@ -163,8 +163,8 @@ class RefineOptions(StageOptions):
         ge=0,
         le=1,
         description="share of the agreeing tie points that must still agree after ICP for it to be "
-        "followed; on "
-        "open ground it may slide. 0 to follow it always, however the surfaces fit",
+        "followed, since on open ground it may slide; where fewer than 20 agree it is followed without them "
+        "too, if surfaces meet far better. 0 to follow it always, however they fit",
     )
 
 
