@@ -19,7 +19,7 @@ from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.types import Bev, Levelling, Pair, Refinement, Side
 from mtpcr_geo.method.icp import Surfaces, rounds_for
 from mtpcr_geo.method.inverse_mapping import tie_points_of
-from mtpcr_geo.method.refine import RefineSettings, refine
+from mtpcr_geo.method.refine import FEW_TIE_POINTS, RefineSettings, refine
 from mtpcr_geo.method.scales import tolerance_for
 from mtpcr_geo.method.solve import solve_tie_points
 from mtpcr_geo.pipeline.stages.matching import shown, view_of
@@ -174,7 +174,8 @@ def refined_from_search(pair: Pair, refined: Refinement, settings: RefineSetting
     """Refine from the pose that the search had judged, where the tie points led elsewhere.
 
     The search judges a pose by all patches and by both grounds. Where few patches agree, as in woods of two
-    years, those that do may agree by chance, and the transform solved from them lies metres off.
+    years, those that do may agree by chance, and the transform solved from them lies metres off. Where more
+    than `FEW_TIE_POINTS` agree they know better, and so they do among rows, which meet as well a row away.
 
     Args:
         pair: solved, with matches.
@@ -182,13 +183,16 @@ def refined_from_search(pair: Pair, refined: Refinement, settings: RefineSetting
         settings: of the refinement.
 
     Returns:
-        The refinement from there, or None where it is the same place, or the surfaces meet no better.
+        The refinement from there, or None where it is the same place, the surfaces meet no better, or the tie
+        points are believed.
 
     """
     matches, tie_points, solved = pair.matches, pair.tie_points, pair.T_target_source
     if matches is None or tie_points is None or solved is None:
         return None
     if not matches.hypotheses or not len(tie_points):
+        return None
+    if matches.repeats or tie_points_agreeing(pair, solved) >= FEW_TIE_POINTS:
         return None
     if settings.method is None or not settings.ground or settings.keep_tie_points == 0:
         return None
