@@ -62,7 +62,7 @@ def test_nobody_is_asked_where_the_search_settles_by_itself() -> None:
 
 @pytest.fixture(scope="module")
 def strip() -> tuple[Bev, Bev, Hypothesis]:
-    return halves(24.0)
+    return halves(16.0)
 
 
 SHARE = 0.7
