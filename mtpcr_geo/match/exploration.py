@@ -16,7 +16,7 @@ from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.pyramid import Level, Pyramid
 from mtpcr_geo.match.repetition import REPEATS, self_likeness
-from mtpcr_geo.match.search import GlobalSearch, Layer, all_yaws, distinct
+from mtpcr_geo.match.search import GlobalSearch, Layer, all_yaws, distinct, score_nearby
 from mtpcr_geo.match.terrain import Terrain, cell_to_compare
 from mtpcr_geo.match.terrain_search import propose
 from mtpcr_geo.method.ground import bare
@@ -234,8 +234,10 @@ class Exploration:
             more = self._propose_by_terrain(cell_m, TERRAIN_HYPOTHESES, COARSEST_YAW_STEP_DEG, robustly=True)
             proposed = distinct([*proposed, *more], len(proposed) + len(more), np.radians(1.0), cell_m / 2)
         others = self._others(proposed)
-        # where crowns of other years fit better a few metres off, the ground knows the place
-        return [*others, *self._nearby(step.factor, others)], 0.0
+        # where crowns of other years fit better a few metres off, the ground knows the place; but strengths are
+        # made of the channels' score, and not of the ground's evidence
+        there = [score_nearby(*self.pyramid.at(1), pose, 1)[0] for pose in others]
+        return [*there, *self._nearby(step.factor, others)], 0.0
 
     def _by_proposals(self, step: Step) -> list[Pose]:
         """Return what others propose, at the finest cells, without what the channels had proposed."""

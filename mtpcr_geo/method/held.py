@@ -54,4 +54,4 @@ def _share_left(refinement: Refinement) -> float:
     if icp is None or not icp.followed:
         return 1.0
     starts = [icp.tried[name].surface_residual for name in ("tie_points", "ground") if name in icp.tried]
-    return icp.tried[icp.chosen].surface_residual / max(min(starts, default=0.0), 1e-12) if starts else 1.0
+    return icp.tried[icp.chosen].surface_residual / max(min(starts), 1e-12) if starts else 1.0

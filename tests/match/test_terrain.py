@@ -9,8 +9,9 @@ import pytest
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.types import Bev, Hypothesis
+from mtpcr_geo.match.exploration import CorrelationSettings, Exploration, Step
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
-from mtpcr_geo.match.search import angle_between
+from mtpcr_geo.match.search import angle_between, score_nearby
 from mtpcr_geo.match.terrain import (
     FEWEST_CELLS,
     Terrain,
@@ -19,6 +20,7 @@ from mtpcr_geo.match.terrain import (
 )
 from mtpcr_geo.match.terrain_search import TerrainSearch, closest, propose, settle
 from mtpcr_geo.method.bev import grid_around, rasterise
+from mtpcr_geo.method.scales import scales_of
 
 CELL = 4.0
 YAW = np.radians(143.0)
@@ -290,6 +292,17 @@ def test_medians_leave_out_single_cells_and_make_none_up() -> None:
     assert (smooth.mask <= mask).all()
     assert smooth.mask[6, 6] == 0.0
     assert (smooth.low[smooth.mask == 0] == 0.0).all()
+
+
+def test_what_the_ground_proposes_is_scored_as_all_else(source: np.ndarray, target: np.ndarray) -> None:
+    s, t = bev_of(source), bev_of(target)
+    search = Exploration(s, t, scales_of(s, t), CorrelationSettings(), 0, lambda _: None)
+    for part in (0, 1):
+        assert search.explore(Step(4, part, "terrain"))
+    assert search.judged
+    for candidate in search.judged:
+        best_near, _ = score_nearby(*search.pyramid.at(1), candidate.pose, 1)
+        assert candidate.pose.score <= 1.01 * best_near.score + 1e-6
 
 
 def test_the_closest_grounds_come_first_though_others_share_more(target) -> None:

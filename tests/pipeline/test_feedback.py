@@ -83,6 +83,12 @@ def beside(pair: Pair, T: np.ndarray, by: tuple[float, float, float]) -> tuple[P
     return off, refined
 
 
+def apart_m(found: np.ndarray, T: np.ndarray) -> float:
+    """Largest step between where two transforms take two corners of the town, metres."""
+    places = transforms.apply(transforms.inverse(T), np.array([[40.0, 40.0, 0.0], [-40.0, -40.0, 0.0]]))
+    return float(np.abs(transforms.apply(found, places) - transforms.apply(T, places)).max())
+
+
 def few_of(pair: Pair) -> Pair:
     """The pair with 12 of its tie points."""
     ties = pair.tie_points
@@ -109,9 +115,7 @@ def test_the_pose_of_the_search_is_refined_where_tie_points_lead_elsewhere(regis
     rows = off.with_(matches=replace(off.matches, repeats=True))
     assert refined_from_search(rows, refined, RefineSettings()) is None, "a row away surfaces meet as well"
     assert found.again is not None
-    places = transforms.apply(transforms.inverse(T), np.array([[40.0, 40.0, 0.0], [-40.0, -40.0, 0.0]]))
-    apart = transforms.apply(found.T, places) - transforms.apply(T, places)
-    assert np.abs(apart).max() < 0.03
+    assert apart_m(found.T, T) < 0.03
 
 
 def test_the_pose_of_the_search_stays_out_where_it_is_the_same_or_surfaces_meet_no_better(registered) -> None:
@@ -143,9 +147,7 @@ def test_tie_points_beside_the_surfaces_are_sought_again_at_coarser_cells(regist
     assert again.cell > pair.cell
     assert again.refinement is not None
     assert ("fed back", again.refinement.again) in transform_rows(again)
-    places = transforms.apply(transforms.inverse(T), np.array([[40.0, 40.0, 0.0], [-40.0, -40.0, 0.0]]))
-    apart = transforms.apply(again.T_target_source, places) - transforms.apply(T, places)
-    assert np.abs(apart).max() < 0.03
+    assert apart_m(again.T_target_source, T) < 0.03
 
 
 def test_nothing_is_sought_again_where_tie_points_and_surfaces_agree(registered) -> None:
@@ -165,9 +167,7 @@ def test_surfaces_that_slid_away_are_not_borne_out_by_coarser_cells(registered) 
     again = matched_coarser(off, slid, RefineSettings(), raster)
     assert again is not None
     assert again.T_target_source is not None
-    places = transforms.apply(transforms.inverse(T), np.array([[40.0, 40.0, 0.0], [-40.0, -40.0, 0.0]]))
-    apart = transforms.apply(again.T_target_source, places) - transforms.apply(T, places)
-    assert np.abs(apart).max() < 0.03
+    assert apart_m(again.T_target_source, T) < 0.03
     # not if they meet as well already, and not among rows, where a third place is the next row
     met = replace(refined, T=T, icp=replace(refined.icp, T_surfaces=away))
     assert matched_coarser(off, met, RefineSettings(), raster) is None
