@@ -234,8 +234,8 @@ class Exploration:
             more = self._propose_by_terrain(cell_m, TERRAIN_HYPOTHESES, COARSEST_YAW_STEP_DEG, robustly=True)
             proposed = distinct([*proposed, *more], len(proposed) + len(more), np.radians(1.0), cell_m / 2)
         others = self._others(proposed)
-        # where crowns of other years fit better a few metres off, the ground knows the place; but strengths are
-        # made of the channels' score, and not of the ground's evidence
+        # where crowns of other years fit better a few metres off, the ground knows the place; but strengths
+        # are made of the channels' score, and not of the ground's evidence
         there = [score_nearby(*self.pyramid.at(1), pose, 1)[0] for pose in others]
         return [*there, *self._nearby(step.factor, others)], 0.0
 
