@@ -3,15 +3,21 @@
     python examples/simulate_pairs.py FOLDER
 
 Extents are 350 to 600 m, 13 to 23 % of either cloud overlaps the other, yaw is any, tilts go to 10 degrees.
-`examples/benchmark_pairs.py FOLDER --as-is` then registers them.
+`examples/benchmark_pairs.py FOLDER --as-is` then registers them. With ``--low-overlap 28`` it writes so many
+upright pairs instead, of all seven kinds in turn: sites of 170 m, 10 to 25 % of either cloud shared, a robot
+or a tripod against an airborne scanner or a drone.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 
-from mtpcr_geo.benchmark.simulator.pairs import simulate_pair, write_pair
+import numpy as np
+
+from mtpcr_geo.benchmark.simulator.pairs import KINDS, SimulatedPair, simulate_pair, write_pair
+from mtpcr_geo.core.errors import OptionError
 
 # kind, seed, extent in metres, overlap, tilt in degrees, aerial scanner, its points per square metre
 SITES = [
@@ -38,9 +44,24 @@ def main() -> None:
     parser.add_argument(
         "--reseed", type=int, default=0, help="add this to every seed: other sites of each kind"
     )
+    parser.add_argument(
+        "--low-overlap", type=int, default=0, help="so many pairs of little overlap instead of these ten"
+    )
     options = parser.parse_args()
+    pairs = low_overlap(options.low_overlap, options.reseed) if options.low_overlap else listed(options)
+    for pair in pairs:
+        write_pair(options.folder / pair.name, pair, overwrite=True)
+        print(
+            f"{pair.name:14} {pair.source.count:8} / {pair.target.count:8} points, overlap "
+            f"{pair.overlap_source:.0%} of the source, {pair.overlap_target:.0%} of the target",
+            flush=True,
+        )
+
+
+def listed(options: argparse.Namespace) -> Iterator[SimulatedPair]:
+    """Yield the pairs of `SITES`."""
     for kind, seed, extent, overlap, tilt, air, density in SITES[: options.first]:
-        pair = simulate_pair(
+        yield simulate_pair(
             kind,
             seed + options.reseed,
             extent_m=extent,
@@ -50,11 +71,27 @@ def main() -> None:
             air=air,
             air_density=density,
         )
-        write_pair(options.folder / pair.name, pair, overwrite=True)
-        print(
-            f"{pair.name:12} {pair.source.count:8} / {pair.target.count:8} points, overlap "
-            f"{pair.overlap_source:.0%} of the source, {pair.overlap_target:.0%} of the target"
-        )
+
+
+def low_overlap(count: int, first_seed: int) -> Iterator[SimulatedPair]:
+    """Yield pairs that share 10 to 25 %, of seeds leaving out a seed that shows nothing."""
+    for seed in range(first_seed, first_seed + count):
+        chance = np.random.default_rng([seed, 41])
+        try:
+            pair = simulate_pair(
+                KINDS[seed % len(KINDS)],
+                seed,
+                extent_m=170.0,
+                overlap=float(chance.uniform(0.10, 0.25)),
+                tilt_deg=0.0,
+                ground=("robot", "tripod")[int(chance.integers(2))],
+                air=("airborne", "uav")[int(chance.integers(2))],
+                air_density=float(chance.uniform(4.0, 14.0)),
+            )
+        except OptionError as error:
+            print(f"left out: {error}", flush=True)
+            continue
+        yield pair
 
 
 if __name__ == "__main__":

@@ -84,7 +84,7 @@ def simulate_pair(kind: Kind, seed: int = 0, **options: Any) -> SimulatedPair:
         options: further fields of `PairOptions`.
 
     Raises:
-        OptionError: if an option is unknown or out of its range, or the ground scan sees nothing.
+        OptionError: if an option is unknown or out of its range, or one of the scans sees nothing.
         MissingPartError: if ``embreex`` is not installed.
 
     """
@@ -125,6 +125,10 @@ def simulate_from(options: PairOptions) -> SimulatedPair:
         caster, fly(block, site.ground.height, options.air_density, chance), how, chance
     )
     high = high.part(block.contains(high.xyz[:, :2]))
+    if not high.extra["GpsTime"].size:
+        raise OptionError(
+            f"the aerial scan of {kind} {seed} saw nothing; take a larger overlap than {options.overlap:g}"
+        )
 
     T_target_site, T_source_site = _frames(path, site, options.tilt_deg, np.random.default_rng([seed, 29]))
     shares = near_shares(occupied_cells(low.xyz), occupied_cells(high.xyz))
