@@ -149,7 +149,10 @@ class IcpResult(ComparesArrays):
         chosen: name of the candidate taken.
         followed: whether it is a run of ICP.
         lost_tie_points: whether a run whose surfaces met better was not followed, since it lost tie points.
-        contested: the same, by however little they met better.
+        left_tie_points: whether the run that was followed lost them: few had agreed, and surfaces met far
+            better.
+        contested: whether surfaces and tie points contradict each other: either of these, by however little
+            surfaces met better.
         rounds: rounds of the run that was followed.
         rotated_deg: angle by which it turned the start, degrees; None where none was followed.
         fine: the last round at a finer thinning, where the density bears one.
@@ -173,6 +176,7 @@ class IcpResult(ComparesArrays):
     fine_voxel_m: float | None = None
     T_surfaces: Floats | None = None
     contested: bool = False
+    left_tie_points: bool = False
 
     def audit(self) -> dict[str, Any]:
         """Return the figures of the runs, for the audit."""
@@ -190,6 +194,7 @@ class IcpResult(ComparesArrays):
             "chosen": self.chosen,
             "followed": self.followed,
             "lost_tie_points": self.lost_tie_points,
+            "left_tie_points": self.left_tie_points,
             **rounds,
         }
 
@@ -207,7 +212,9 @@ class Refinement(ComparesArrays):
         equations: of the last round of ICP, in blocks; None where none was followed.
         slid_m: how far ICP had slid in plan where plan and yaw were left as the tie points have them, metres;
             None where they were not.
-        again: why clouds were matched and solved a second time before, for people; None where they were not.
+        again: why clouds were matched and solved a second time before, or refined from another place than the
+            tie points', for people; None where they were not.
+        T_solved: 4x4 where the tie points had led, if the refinement began elsewhere; None if it began there.
 
     """
 
@@ -219,6 +226,7 @@ class Refinement(ComparesArrays):
     equations: BlockEquations | None = None
     slid_m: float | None = None
     again: str | None = None
+    T_solved: Floats | None = None
 
     def audit(self) -> dict[str, Any]:
         """Return what each step did, for the audit."""

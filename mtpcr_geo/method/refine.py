@@ -13,19 +13,15 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.system import usable_cores
-from mtpcr_geo.core.types import GroundFit, IcpMethod, IcpResult, IcpRound, IcpTrial, Refinement
+from mtpcr_geo.core.types import IcpMethod, IcpResult, IcpRound, IcpTrial, Refinement
 from mtpcr_geo.method.icp import Descent, Rounds, Surfaces, rounds_for
 from mtpcr_geo.method.jackknife import equations_of_surfaces
-from mtpcr_geo.method.overlap import OVERLAP_CELL_M, Overlap, overlap_of
+from mtpcr_geo.method.overlap import overlap_of
 from mtpcr_geo.method.scales import ground_cell_for
+from mtpcr_geo.method.settle import beyond_scatter, settle_on_ground
 
 Motion = Literal["rigid", "yaw", "translation"]
 
-FEWEST_GROUND_CELLS = 30
-CORRELATED_CELLS = 50
-GROUND_NOISE_M = 0.5
-LEVEL_SIGMA_DEG = 1.0
-SCATTER_SHARE, SCATTER_M = 0.5, 0.03
 FINE_SPACINGS = 4.0
 """Voxel of the last round in mean distances between points of the sparser cloud."""
 FINEST_VOXEL_M = 0.2
@@ -67,7 +63,8 @@ class RefineSettings:
         motion: degrees of freedom of the result: all six, yaw and shift, or the shift alone.
         ground: settle height and tilt on the ground before ICP, and the height after it.
         keep_tie_points: share of the agreeing tie points that must still agree after ICP for it to be
-            followed; 0 to follow it always.
+            followed; 0 to follow it always. Where fewer than `FEW_TIE_POINTS` agree it is followed without
+            them too, if surfaces meet far better.
 
     """
 
@@ -112,7 +109,7 @@ def refine(
 
     """
     upright = R_upright is None or bool(np.abs(R_upright - np.eye(3)).max() < UPRIGHT)
-    if upright and len(source) > len(target):
+    if upright and target_moves(source, target):
         back = _refine(
             target,
             source,
@@ -129,6 +126,20 @@ def refine(
     middle = transforms.centroid(source) if pivot is None else pivot
     T = constrain(found.T, settings.motion, middle, np.eye(3) if R_upright is None else R_upright)
     return replace(found, T=T)
+
+
+def target_moves(source: Floats, target: Floats) -> bool:
+    """Return whether the target is the smaller of two upright clouds, and moves in the source's stead.
+
+    Of two of one size it is the one that spreads less: exchanged, the same cloud moves.
+
+    Args:
+        source, target: (n, 3) and (m, 3) work coordinates, metres.
+
+    """
+    if len(source) != len(target):
+        return len(source) > len(target)
+    return tuple(source.std(axis=0)) > tuple(target.std(axis=0))
 
 
 def inverse_of(refinement: Refinement) -> Refinement:
@@ -290,8 +301,8 @@ def follow_icp(
         starts: 4x4 from source to target work coordinates by name; ICP starts from the last.
         rounds: the runs of ICP to try, by name.
         agreeing: counts the tie points that a transform brings together.
-        keep_tie_points: share of the tie points agreeing at the last start that must still agree; 0
-            follows ICP always.
+        keep_tie_points: share of the tie points agreeing at the last start that must still agree, unless
+            these are few and surfaces meet far better; 0 follows ICP always.
         method: of `Surfaces.descend`.
         iterations: at most, each round.
 
@@ -338,6 +349,7 @@ def follow_icp(
         best = BETWEEN
     else:
         run = runs.get(best)
+    left = run is not None and trials[best].tie_points < wanted
     rotated = None
     if run is not None:
         rotation = tried[best][:3, :3] @ starts[last][:3, :3].T
@@ -355,80 +367,9 @@ def follow_icp(
         rounds=run.rounds if run is not None else (),
         rotated_deg=rotated,
         T_surfaces=min(runs.items(), key=lambda one: trials[one[0]].surface_residual)[1].T,
-        contested=bool(better),
+        contested=bool(better) or left,
+        left_tie_points=left,
     )
-
-
-def settle_on_ground(
-    source: Floats,
-    target: Floats,
-    T_start: Floats,
-    *,
-    tilt: bool,
-    overlap: Overlap | None = None,
-    cell: float = OVERLAP_CELL_M,
-) -> GroundFit:
-    """Correct the height, and if wanted the tilt, so that both clouds' ground agrees.
-
-    Canopy and facades bias the height of a fit to everything; the lowest surface does not. A plane is
-    fitted to the ground's height differences with weights that fade for what does not agree.
-
-    Args:
-        source, target: (n, 3) and (m, 3) work coordinates, metres.
-        T_start: 4x4 from source to target.
-        tilt: whether to correct the tilt too, where the ground extends far enough to tell it.
-        overlap: both clouds on one grid under ``T_start``, if at hand.
-        cell: in which the ground is compared, metres, where the overlap is not at hand.
-
-    """
-    if overlap is None:
-        overlap = overlap_of(transforms.apply(T_start, source), target, cell)
-    xy, step = overlap.ground_steps()
-    if len(step) < FEWEST_GROUND_CELLS:
-        return GroundFit(T_start, len(step))
-    centre = xy.mean(axis=0)
-    offset = xy - centre
-    A = np.column_stack([np.ones(len(step)), offset]) if tilt else np.ones((len(step), 1))
-    # neighbouring cells err together, and clouds come levelled to about a degree: both bound the tilt
-    prior = np.zeros((A.shape[1], A.shape[1]))
-    if tilt:
-        prior[1, 1] = prior[2, 2] = CORRELATED_CELLS * GROUND_NOISE_M**2 / np.radians(LEVEL_SIGMA_DEG) ** 2
-    x = np.zeros(A.shape[1])
-    x[0] = np.median(step)
-    scale = 1.0
-    for scale in (2.0, 1.0, 0.6, 0.4, 0.3, 0.3, 0.3, 0.3):
-        residual = step - A @ x
-        weight = 1.0 / (1.0 + (residual / scale) ** 2) ** 2
-        x = np.linalg.solve((A * weight[:, None]).T @ A + prior, (A * weight[:, None]).T @ step)
-    residual = step - A @ x
-    close = np.abs(residual) < 3 * scale
-    spread = 1.4826 * float(np.median(np.abs(residual[close]))) if close.any() else float("nan")
-    pivot = np.array([centre[0], centre[1], float(np.nanmedian(overlap.source.low))])
-    R = np.eye(3)
-    slope = float(np.hypot(x[1], x[2])) if tilt else 0.0
-    if slope > 1e-12:
-        # raising the ground towards +x means turning about -y, and towards +y about +x
-        R = transforms.axis_angle_matrix(np.array([x[2], -x[1], 0.0]) / slope, float(np.arctan(slope)))
-    T = transforms.translation((0.0, 0.0, float(x[0]))) @ transforms.about(pivot, R) @ T_start
-    return GroundFit(
-        T,
-        cells=len(step),
-        agreeing=int(close.sum()),
-        rise_m=float(x[0]),
-        spread_m=spread,
-        tilt_deg=float(np.degrees(transforms.rotation_angle(R))),
-    )
-
-
-def beyond_scatter(settled: GroundFit) -> bool:
-    """Return whether the ground's rise is more than what the borders of its cells can cause.
-
-    The lowest of a cell lies the lower the denser the cloud and the steeper the ground, by a part of the
-    cells' own scatter. A fit to all points knows the height better than that.
-    """
-    if settled.rise_m is None or settled.spread_m is None:
-        return False
-    return bool(abs(settled.rise_m) > min(SCATTER_SHARE * settled.spread_m, SCATTER_M))
 
 
 def constrain(T: Floats, motion: Motion, pivot: Floats, R_upright: Floats) -> Floats:

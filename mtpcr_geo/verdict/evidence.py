@@ -79,7 +79,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         ground_noise_m=shape.noise_m if np.isfinite(shape.spread_m) else None,
         repeats=matches is not None and matches.repeats,
         refined_away_m=_refined_away(pair, T),
-        refinement_lost=icp is not None and icp.lost_tie_points,
+        refinement_lost=icp is not None and (icp.lost_tie_points or icp.left_tie_points),
         null_ratio=matches.null_ratio if matches is not None else None,
         null_p=None if matches is None else null_probability(matches.strength, matches.mirrored_strengths),
         least_overlap_m2=_least_overlap_m2(pair),
@@ -236,16 +236,34 @@ def cross_validated(tie_points: TiePoints, tolerance: float, settings: SolveSett
 
 
 def _refined_away(pair: Pair, T: Floats) -> float:
-    """Return how far the refinement moved the middle of the tie points in plan, metres.
+    """Return how far the refinement ended from where the tie points had led, in plan, metres."""
+    if pair.refinement is None:
+        return 0.0
+    solved = pair.refinement.T_solved
+    return moved_in_plan(pair, pair.refinement.T_before if solved is None else solved, T)
+
+
+def middle_of_tie_points(pair: Pair) -> Floats | None:
+    """Return the mean of the tie points' source ends, (3,) source work coordinates; None without any."""
+    if pair.tie_points is None or not len(pair.tie_points):
+        return None
+    middle = pair.tie_points.source.mean(axis=0, keepdims=True)
+    return np.asarray(transforms.apply(transforms.inverse(pair.source.T_level_work), middle)[0])
+
+
+def moved_in_plan(pair: Pair, before: Floats, after: Floats) -> float:
+    """Return how far apart two transforms put the middle of the tie points in plan, metres; 0 without any.
 
     Height is not counted: tie points are matched in plan, and take theirs from levelled rasters, which a
     degree of tilt raises by metres. That of the result is judged by the ground.
+
+    Args:
+        pair: with tie points.
+        before, after: 4x4 from source to target work coordinates.
+
     """
-    before = pair.refinement.T_before if pair.refinement is not None else None
-    if before is None or pair.tie_points is None or not len(pair.tie_points.source):
+    middle = middle_of_tie_points(pair)
+    if middle is None:
         return 0.0
-    middle = transforms.apply(
-        transforms.inverse(pair.source.T_level_work), pair.tie_points.source.mean(axis=0, keepdims=True)
-    )
-    moved = transforms.apply(T, middle)[0] - transforms.apply(before, middle)[0]
+    moved = transforms.apply(after, middle[None])[0] - transforms.apply(before, middle[None])[0]
     return float(np.hypot(*(pair.target.T_level_work[:3, :3] @ moved)[:2]))

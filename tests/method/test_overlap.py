@@ -9,7 +9,7 @@ from helpers_plots import plot, terrain
 from mtpcr_geo.core import transforms
 from mtpcr_geo.method.bev import grid_around, rasterise
 from mtpcr_geo.method.overlap import CommonGround, _ground, overlap_of
-from mtpcr_geo.method.refine import settle_on_ground
+from mtpcr_geo.method.settle import settle_on_ground
 
 
 def hillside(seed: int, slope: float, n: int = 60_000, extent: float = 120.0) -> np.ndarray:

@@ -18,8 +18,8 @@ from mtpcr_geo.method.refine import (
     fine_voxel,
     follow_icp,
     refine,
-    settle_on_ground,
 )
+from mtpcr_geo.method.settle import settle_on_ground
 from mtpcr_geo.verdict.evidence import gather, tie_points_agreeing
 
 

@@ -4,6 +4,7 @@ Tie points matched under a wrong vertical agree with a wrong transform. Where a 
 following the surfaces alone, tilts the source, those tie points cannot judge that; the ones found under the
 new vertical can. And where cells are hardly filled, what matches may be the pattern of the points and not
 what they lie on: tie points then agree a cell or two beside the truth, and those of coarser cells do not.
+Where hardly any tie point agrees, the pose that the search had judged is refined too.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.types import Bev, Levelling, Pair, Refinement, Side
 from mtpcr_geo.method.icp import Surfaces, rounds_for
 from mtpcr_geo.method.inverse_mapping import tie_points_of
-from mtpcr_geo.method.refine import FEW_TIE_POINTS, RefineSettings, refine
+from mtpcr_geo.method.refine import FEW_TIE_POINTS, RefineSettings, refine, target_moves
 from mtpcr_geo.method.scales import tolerance_for
 from mtpcr_geo.method.solve import solve_tie_points
 from mtpcr_geo.pipeline.stages.matching import shown, view_of
-from mtpcr_geo.verdict.evidence import tie_points_agreeing
+from mtpcr_geo.verdict.evidence import middle_of_tie_points, moved_in_plan, tie_points_agreeing
 
 LEAST_TILT_DEG = 0.3
 """Tilt left between the levelled clouds from which on a new vertical is worth a second search."""
@@ -103,7 +104,7 @@ def fed_back(
         strength, before = found.strength or 0.0, matches.strength or 0.0
         if strength < WEAKEST * before:
             return None
-        refinement = _refined(again, settings)
+        refinement = refined_pair(again, settings)
     except RegistrationError:
         return None  # a second search never costs the first
     if strength < before and not borne_out(refined, refinement):
@@ -138,7 +139,9 @@ def matched_coarser(
         return None
     if icp is None or icp.T_surfaces is None or settings.motion != "rigid":
         return None
-    if not icp.contested and (refined.slid_m or 0.0) <= tolerance_for(pair.cell):
+    # among rows surfaces may slide, whether that is undone or not
+    slid = refined.slid_m or (moved_in_plan(pair, refined.T_before, refined.T) if matches.repeats else 0.0)
+    if not icp.contested and slid <= tolerance_for(pair.cell):
         return None
     if (matches.margin or 0.0) < SURE or (matches.null_ratio is not None and matches.null_ratio < SURE):
         return None
@@ -157,7 +160,7 @@ def matched_coarser(
         beside = _apart_m(pair, anew, icp.T_surfaces) >= _apart_m(pair, anew, pair.T_target_source)
         if beside and not icp.contested:
             return None  # along rows both are near, and the nearer counts
-        refinement = _refined(again, settings)
+        refinement = refined_pair(again, settings)
     except RegistrationError:
         return None  # a second search never costs the first
     met = refinement.icp
@@ -174,52 +177,56 @@ def refined_from_search(pair: Pair, refined: Refinement, settings: RefineSetting
     """Refine from the pose that the search had judged, where the tie points led elsewhere.
 
     The search judges a pose by all patches and by both grounds. Where few patches agree, as in woods of two
-    years, those that do may agree by chance, and the transform solved from them lies metres off. Where more
-    than `FEW_TIE_POINTS` agree they know better, and so they do among rows, which meet as well a row away.
+    years, those that do may agree by chance, and the transform solved from them lies metres off. Where
+    `FEW_TIE_POINTS` or more agree they know better, and so they do among rows, which meet as well a row away.
 
     Args:
-        pair: solved, with matches.
+        pair: solved, with matches of a matcher that judges patches.
         refined: what the refinement of the solved transform came to.
         settings: of the refinement.
 
     Returns:
-        The refinement from there, or None where it is the same place, the surfaces meet no better, or the tie
-        points are believed.
+        The refinement from there, or None where it is the same place, the surfaces do not meet clearly
+        better, or the tie points are believed.
 
     """
     matches, tie_points, solved = pair.matches, pair.tie_points, pair.T_target_source
-    if matches is None or tie_points is None or solved is None:
+    if matches is None or matches.matcher is None or matches.matcher.needs_image or not matches.hypotheses:
         return None
-    if not matches.hypotheses or not len(tie_points):
+    if tie_points is None or solved is None or not len(tie_points):
         return None
     if matches.repeats or tie_points_agreeing(pair, solved) >= FEW_TIE_POINTS:
         return None
-    if settings.method is None or not settings.ground or settings.keep_tie_points == 0:
+    if settings.method is None or settings.motion != "rigid":
+        return None
+    if not settings.ground or settings.keep_tie_points == 0:
         return None
     judged = matches.hypotheses[0]
     T_level = transforms.compose(transforms.yaw_matrix(judged.yaw), np.array([*judged.shift, 0.0]))
-    places, judged_places = (transforms.apply(T, tie_points.source) for T in (pair.levelled(solved), T_level))
-    step = places - judged_places
-    if float(np.hypot(step[:, 0], step[:, 1]).mean()) <= tolerance_for(pair.cell):
-        return None
-    T_level = transforms.translation((0.0, 0.0, float(step[:, 2].mean()))) @ T_level
     T = transforms.inverse(pair.target.T_level_work) @ T_level @ pair.source.T_level_work
+    steps = _steps(pair, T, solved)
+    if float(np.hypot(steps[:, 0], steps[:, 1]).mean()) <= tolerance_for(pair.cell):
+        return None
+    rise = transforms.translation((0.0, 0.0, float(steps[:, 2].mean())))
+    T = transforms.inverse(pair.target.T_level_work) @ rise @ T_level @ pair.source.T_level_work
     try:
-        refinement = _refined(pair.with_(T_target_source=T), settings)
+        refinement = refined_pair(pair.with_(T_target_source=T), settings)
     except RegistrationError:
         return None  # a second opinion never costs the first
     both = refined.T, refinement.T
     if _apart_m(pair, *both) <= tolerance_for(pair.cell):
         return None  # both led to one place
-    if not all(later < first for first, later in (_met(pair, about, both, settings) for about in both)):
+    if not all(_meet_better(pair, *both, settings, about=about) for about in both):
         return None
     why = "refined from the pose of the search: surfaces met better there than where the tie points led"
-    return replace(refinement, again=why)
+    return replace(refinement, again=why, T_solved=solved)
 
 
-def _meet_better(pair: Pair, before: Floats, after: Floats, settings: RefineSettings) -> bool:
-    """Return whether the same surfaces, those of the overlap before, meet clearly better after."""
-    first, later = _met(pair, before, (before, after), settings)
+def _meet_better(
+    pair: Pair, before: Floats, after: Floats, settings: RefineSettings, about: Floats | None = None
+) -> bool:
+    """Return whether the same surfaces, those of the overlap before or about another, meet clearly better."""
+    first, later = _met(pair, before if about is None else about, (before, after), settings)
     return later <= BETTER * first
 
 
@@ -230,7 +237,7 @@ def _met(pair: Pair, about: Floats, those: Sequence[Floats], settings: RefineSet
     """
     distance = max(max(one.max_correspondence_distances_m) for one in rounds_for(pair.cell).values())
     clouds = pair.source.sample, pair.target.sample
-    if len(clouds[0]) > len(clouds[1]):
+    if target_moves(*clouds):
         # the smaller cloud moves, as in the refinement, so that source and target exchanged say the same
         clouds, about, those = clouds[::-1], transforms.inverse(about), [*map(transforms.inverse, those)]
     try:
@@ -247,10 +254,32 @@ def _met(pair: Pair, about: Floats, those: Sequence[Floats], settings: RefineSet
 
 
 def _apart_m(pair: Pair, A: Floats, B: Floats) -> float:
-    """Return how far two transforms put the tie points' source ends from each other, the mean in metres."""
+    """Return how far two transforms put the tie points from each other, the mean in metres."""
+    return float(np.linalg.norm(_steps(pair, A, B), axis=1).mean())
+
+
+def _steps(pair: Pair, A: Floats, B: Floats) -> Floats:
+    """Return the steps from where one transform puts the tie points to where another does.
+
+    Args:
+        pair: with tie points.
+        A, B: 4x4 from source to target work coordinates.
+
+    Returns:
+        (2 n, 3) metres in the levelled target's axes: of the n source ends, and of the n target ends brought
+        back and forth, so that source and target exchanged give steps of the same lengths.
+
+    """
     assert pair.tie_points is not None
-    places = transforms.apply(transforms.inverse(pair.source.T_level_work), pair.tie_points.source)
-    return float(np.linalg.norm(transforms.apply(A, places) - transforms.apply(B, places), axis=1).mean())
+    source, target = (
+        transforms.apply(transforms.inverse(side.T_level_work), ends)
+        for side, ends in ((pair.source, pair.tie_points.source), (pair.target, pair.tie_points.target))
+    )
+    steps = [
+        transforms.apply(B, ends) - transforms.apply(A, ends)
+        for ends in (source, transforms.apply(transforms.inverse(A), target))
+    ]
+    return np.concatenate(steps) @ pair.target.T_level_work[:3, :3].T
 
 
 def borne_out(before: Refinement, after: Refinement) -> bool:
@@ -259,14 +288,21 @@ def borne_out(before: Refinement, after: Refinement) -> bool:
     Seen from above a scene that leans by some degrees looks much the same: the matches of the right vertical
     may be a little weaker than those of a wrong one.
     """
-    if before.icp is None or after.icp is None or not before.icp.lost_tie_points:
+    if before.icp is None or after.icp is None:
+        return False
+    if not (before.icp.lost_tie_points or before.icp.left_tie_points):
         return False
     first, last = (one.tried[one.chosen].surface_residual for one in (before.icp, after.icp))
-    return after.icp.followed and not after.icp.lost_tie_points and last <= CLOSER * first
+    contradicted = after.icp.lost_tie_points or after.icp.left_tie_points
+    return after.icp.followed and not contradicted and last <= CLOSER * first
 
 
-def _refined(pair: Pair, settings: RefineSettings) -> Refinement:
-    """Refine a solved pair.
+def refined_pair(pair: Pair, settings: RefineSettings) -> Refinement:
+    """Refine the transform of a pair.
+
+    Args:
+        pair: with a transform; tie points tell the middle of the overlap, and what agrees.
+        settings: of the refinement.
 
     Raises:
         RegistrationError: if too little of the clouds is brought together.
@@ -280,6 +316,8 @@ def _refined(pair: Pair, settings: RefineSettings) -> Refinement:
         settings,
         cell=pair.cell,
         agreeing=lambda T: tie_points_agreeing(pair, T),
+        pivot=middle_of_tie_points(pair),
+        R_upright=pair.target.T_level_work[:3, :3].T @ pair.source.T_level_work[:3, :3],
     )
 
 

@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar, Literal
 
-import numpy as np
 from pydantic import Field
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import OptionError, RegistrationError
 from mtpcr_geo.core.types import Bev, Pair, Refinement, Side, SolveSettings
 from mtpcr_geo.method.scales import tolerance_for
@@ -182,10 +180,14 @@ class Refine(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Refine the solved transform."""
-        from mtpcr_geo.method.refine import RefineSettings, refine
-        from mtpcr_geo.pipeline.stages.feedback import fed_back, matched_coarser, refined_from_search
+        from mtpcr_geo.method.refine import RefineSettings
+        from mtpcr_geo.pipeline.stages.feedback import (
+            fed_back,
+            matched_coarser,
+            refined_from_search,
+            refined_pair,
+        )
         from mtpcr_geo.pipeline.stages.rasters import rasterised
-        from mtpcr_geo.verdict.evidence import tie_points_agreeing
 
         pair = self.one_pair(inputs)
         if pair.T_target_source is None:
@@ -203,16 +205,7 @@ class Refine(Stage):
             ground=options.ground,
             keep_tie_points=options.keep_tie_points,
         )
-        refinement = refine(
-            pair.source.sample,
-            pair.target.sample,
-            pair.T_target_source,
-            settings,
-            cell=pair.cell,
-            agreeing=lambda T: tie_points_agreeing(pair, T),
-            pivot=_middle_of_tie_points(pair),
-            R_upright=pair.target.T_level_work[:3, :3].T @ pair.source.T_level_work[:3, :3],
-        )
+        refinement = refined_pair(pair, settings)
 
         def raster_at(side: Side, cell: float) -> Bev:
             return rasterised(side, cell, "centre", context)
@@ -221,7 +214,6 @@ class Refine(Stage):
             elsewhere = refined_from_search(pair, refinement, settings)
             if elsewhere is not None:
                 pair, refinement = pair.with_(T_target_source=elsewhere.T_before), elsewhere
-                self.metadata["from_search"] = True
         trusted = pair.source.levelling.trusted and pair.target.levelling.trusted
         if not trusted and options.feedback:
             again = fed_back(pair, refinement, settings, raster_at)
@@ -241,28 +233,21 @@ class Refine(Stage):
                 self.metadata |= {"matched_again_cell_m": again.cell, **again.refinement.audit()}
                 return again
         assert found.refinement is not None
-        self.metadata |= found.refinement.audit()
+        from_search = {} if found.refinement.T_solved is None else {"from_search": True}
+        self.metadata |= {**from_search, **found.refinement.audit()}
         return found
 
 
 def _held(pair: Pair, refinement: Refinement) -> Pair:
     """Return the pair refined; where the scene repeats itself, no farther than its tie points allow."""
     from mtpcr_geo.method.held import SLIDES_CELLS, held_to_tie_points
+    from mtpcr_geo.verdict.evidence import middle_of_tie_points
 
-    middle = _middle_of_tie_points(pair)
+    middle = middle_of_tie_points(pair)
     if pair.matches is not None and pair.matches.repeats and middle is not None:
         R_level = pair.target.T_level_work[:3, :3]
         refinement = held_to_tie_points(refinement, middle, R_level, SLIDES_CELLS * pair.cell)
     return pair.with_(T_target_source=refinement.T, refinement=refinement)
-
-
-def _middle_of_tie_points(pair: Pair) -> Floats | None:
-    """Return the mean of the tie points' source ends, (3,) source work coordinates; None without any."""
-    if pair.tie_points is None or not len(pair.tie_points):
-        return None
-    T_work_level = transforms.inverse(pair.source.T_level_work)
-    middle = pair.tie_points.source.mean(axis=0, keepdims=True)
-    return np.asarray(transforms.apply(T_work_level, middle)[0])
 
 
 class AssessOptions(StageOptions):
