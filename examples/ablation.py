@@ -45,8 +45,9 @@ def main() -> None:
     parser.add_argument(
         "--robust", action="store_true", help="start the SVD from what most tie points agree on"
     )
-    parser.add_argument("--band-pass", action="store_true", help="band-passed heights as enhancement")
-    parser.add_argument(
+    images = parser.add_mutually_exclusive_group()
+    images.add_argument("--band-pass", action="store_true", help="band-passed heights as enhancement")
+    images.add_argument(
         "--printed",
         action="store_true",
         help="the paper's cells and filters, whatever the matcher was trained on",

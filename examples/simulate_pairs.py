@@ -11,13 +11,19 @@ or a tripod against an airborne scanner or a drone.
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from mtpcr_geo.benchmark.simulator.pairs import KINDS, SimulatedPair, simulate_pair, write_pair
-from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.benchmark.simulator.pairs import (
+    KINDS,
+    NothingSeenError,
+    SimulatedPair,
+    simulate_pair,
+    write_pair,
+)
 
 # kind, seed, extent in metres, overlap, tilt in degrees, aerial scanner, its points per square metre
 SITES = [
@@ -74,8 +80,11 @@ def listed(options: argparse.Namespace) -> Iterator[SimulatedPair]:
 
 
 def low_overlap(count: int, first_seed: int) -> Iterator[SimulatedPair]:
-    """Yield pairs that share 10 to 25 %, of seeds leaving out a seed that shows nothing."""
-    for seed in range(first_seed, first_seed + count):
+    """Yield so many pairs that share 10 to 25 %, of seeds from the first on that show anything."""
+    found = 0
+    for seed in itertools.count(first_seed):
+        if found >= count:
+            return
         chance = np.random.default_rng([seed, 41])
         try:
             pair = simulate_pair(
@@ -88,9 +97,10 @@ def low_overlap(count: int, first_seed: int) -> Iterator[SimulatedPair]:
                 air=("airborne", "uav")[int(chance.integers(2))],
                 air_density=float(chance.uniform(4.0, 14.0)),
             )
-        except OptionError as error:
+        except NothingSeenError as error:
             print(f"left out: {error}", flush=True)
             continue
+        found += 1
         yield pair
 
 

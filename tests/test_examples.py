@@ -73,7 +73,7 @@ def test_simulate_pairs(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_simulate_pairs_of_little_overlap(tmp_path: Path) -> None:
     # the drone sees nothing of the first: it is left out, and said
-    reported = run("simulate_pairs.py", tmp_path, "--low-overlap", 2, "--reseed", 20626)
+    reported = run("simulate_pairs.py", tmp_path, "--low-overlap", 1, "--reseed", 20626)
     assert "left out: the aerial scan of farmland 20626 saw nothing" in reported
     assert (tmp_path / "steep_20627" / "pair.json").exists()
 

@@ -48,7 +48,7 @@ _LABELS = {
     "probability": "probability of being right (5 degrees, 2 m)",
     "probability_precise": "probability of being precise (0.2 degrees, 0.5 m)",
     "refinement_lost": "refinement lost the tie points",
-    "refined_away_m": "moved by the refinement",
+    "refined_away_m": "refined away from the tie points",
     "vertical_offset_m": "height offset found",
     "yaw_deg": "yaw, work frame",
     "tilt_deg": "tilt, work frame",
@@ -263,6 +263,7 @@ def refinement_text(icp: IcpResult) -> str:
         return (
             f"ICP ({icp.method}) with correspondences up to {rounds} m; "
             f"surface residual {surface_residual:.2f}"
+            + ("; the few tie points that had agreed were left" if icp.left_tie_points else "")
         )
     why = "ICP lost the tie points" if icp.lost_tie_points else "after ICP surfaces met worse"
     kept = {"tie_points": "the tie points alone", "ground": "tie points and ground"}[icp.chosen]

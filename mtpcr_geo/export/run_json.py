@@ -114,8 +114,10 @@ The metrics:
   runs of known answer; null from keypoints
 - ``metrics.probability_precise``: the same of being within 0.2 degrees and 0.5 m, from that and from the
   uncertainty; null where either is not known
-- ``metrics.refinement_lost``: whether surfaces fit better where the tie points do not agree
-- ``metrics.refined_away_m``: how far the refinement moved the middle of the tie points, in plan
+- ``metrics.refinement_lost``: whether surfaces fit better where the tie points do not agree, and these were
+  followed
+- ``metrics.refined_away_m``: how far the refinement ended from where the tie points had led, in plan, at the
+  middle of these
 - ``metrics.vertical_offset_m``: metres added to the source's heights, with vertical: estimate
 - ``metrics.yaw_deg``: yaw of the transform in the work frame, counter-clockwise from above
 - ``metrics.tilt_deg``: angle by which it tilts the vertical
@@ -316,6 +318,8 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.refine icp.chosen``: the candidate that was taken
 - ``mtpcr.refine icp.followed``: whether that is a run of ICP
 - ``mtpcr.refine icp.lost_tie_points``: whether a run was not followed because tie points were lost
+- ``mtpcr.refine icp.left_tie_points``: whether the run that was followed lost them: few had agreed, and
+  surfaces met far better
 - ``mtpcr.refine icp.rounds[].max_correspondence_distance_m``: farthest correspondence of each round
 - ``mtpcr.refine icp.rounds[].iterations``: its iterations
 - ``mtpcr.refine icp.rounds[].inliers``: points with a correspondence at its end
@@ -329,7 +333,7 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.refine slid_m``: how far ICP had gone in plan from the tie points of a scene that repeats itself,
   where that was too far and plan and yaw were left as the tie points have them
 - ``mtpcr.refine from_search``: whether the pose of the search was refined in place of what the tie points led
-  to, since surfaces met better there
+  to, since surfaces met better there; then the figures are of the refinement from there
 - ``mtpcr.refine levelled_again``: whether the source was levelled by the vertical that ICP found, matched and
   solved again; then the figures are those of the second refinement
 - ``mtpcr.refine matched_again_cell_m``: where surfaces met better beside the tie points, and new tie points

@@ -172,6 +172,17 @@ def _check_rigid(T: Floats) -> None:
         raise ValueError("T_target_source is no rigid transform")
 
 
+def verdict_of(path: str | Path) -> dict[str, Any] | None:
+    """Return what a ``transform.json`` says of its verdict, name, reasons and so on; None if nothing.
+
+    Args:
+        path: the file, which `read_transform` takes.
+
+    """
+    stated = json.loads(read_whole(path)).get("verdict")
+    return stated if isinstance(stated, dict) else None
+
+
 def doubts_of(path: str | Path) -> str | None:
     """Return a sentence if a ``transform.json`` says that its verdict is not accepted; None if not.
 
@@ -179,8 +190,8 @@ def doubts_of(path: str | Path) -> str | None:
         path: the file, which `read_transform` takes.
 
     """
-    stated = json.loads(read_whole(path)).get("verdict")
-    if not isinstance(stated, dict) or stated.get("name") in (None, "accepted"):
+    stated = verdict_of(path)
+    if stated is None or stated.get("name") in (None, "accepted"):
         return None
     reasons = stated.get("reasons")
     why = f": {reasons[0]}" if isinstance(reasons, list) and reasons else ""

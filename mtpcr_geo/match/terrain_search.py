@@ -47,7 +47,8 @@ def propose(
         least_m2: ground that both must show under a pose, square metres.
         prior: what is known of the pose; None to search everywhere.
         plane: whether a plane of height differences is free too, for clouds whose vertical is not trusted.
-        robustly: smooth both grounds, and rank more poses, by the robust spread of what they differ.
+        robustly: smooth both grounds, and choose the poses that are settled by the robust spread of what they
+            differ, from several shifts of each yaw.
 
     """
     source, target = (Terrain.of(bev, cell_m) for bev in bare)
@@ -112,7 +113,7 @@ class TerrainSearch:
 
         Args:
             yaw: radians.
-            count: how many by each at most; they lie `APART_CELLS` from each other.
+            count: how many by each at most; they lie more than `APART_CELLS` apart, but on flats.
 
         Returns:
             Those by evidence, and those by closeness, best first; none where nothing is considered.

@@ -33,6 +33,11 @@ SAME_WITHIN = 0.001
 """Farthest that a corner of the source may come to lie elsewhere, in units of the result, to be the same."""
 _METRIC_SHARE = 1e-3
 _WRITERS = ("writers.", "mtpcr.write")
+_STATED = {
+    "name": "verdict", "sentence": "sentence", "probability": "probability", "reasons": "reasons",
+    "rivals": "rivals", "forced": "forced",
+}  # fmt: skip
+"""What a transform.json says of the verdict, and where run.json says it."""
 
 
 @dataclass(frozen=True)
@@ -206,11 +211,14 @@ def _files(record: Mapping[str, Any], place: Path) -> Iterator[Difference]:
     """Compare what other files of the run say with its run.json."""
     transform = place / OUTPUT_NAMES["transform"]
     if transform.is_file():
-        from mtpcr_geo.export.transform import read_transform
+        from mtpcr_geo.export.transform import read_transform, verdict_of
 
         kept, T = read_transform(transform).T_file, record.get("T_target_source")
         if T is None or not np.array_equal(kept, np.array(T, np.float64)):
             yield Difference("file", transform.name, "the transform of run.json", "another transform")
+        stated = verdict_of(transform)
+        if stated is not None and any(stated.get(name) != record.get(key) for name, key in _STATED.items()):
+            yield Difference("file", transform.name, "the verdict of run.json", "another verdict")
     recording = place / OUTPUT_NAMES["recording"]
     if recording.is_file():
         from mtpcr_geo.export.recording.trail import read_trail

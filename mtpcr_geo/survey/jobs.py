@@ -116,12 +116,13 @@ def _of_table(path: Path, target: Path | None, common: Mapping[str, Any]) -> lis
 
 
 def _given(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options that are not at their defaults, checked."""
+    """Return options that are not at their defaults, checked; and that of the recording, off in a batch."""
     wrong = next((key for key in options if key in _OF_THE_BATCH), None)
     if wrong is not None:
         raise OptionError(f"{wrong} is an option of the whole batch, and of no job")
     read = read_options(dict(options))
-    return read.model_dump(mode="json", exclude_defaults=True)
+    asked = {"recording": read.recording} if "recording" in options else {}
+    return read.model_dump(mode="json", exclude_defaults=True) | asked
 
 
 def _value(name: str, text: str) -> Any:

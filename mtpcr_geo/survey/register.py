@@ -20,6 +20,7 @@ from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import InputError, OptionError
 from mtpcr_geo.core.paths import real
 from mtpcr_geo.core.progress import NoProgress, Progress
+from mtpcr_geo.core.system import cores
 from mtpcr_geo.core.types import Hypothesis, Levelling, Matches, Pair
 from mtpcr_geo.io.formats import files_at, open_any
 from mtpcr_geo.io.memory import cloud_of
@@ -264,16 +265,18 @@ def register_in_survey(
     writers = [] if out is None else writers_for(source, Path(out), chosen)
     _refuse_existing(writers, chosen)
     _check_foreign(source, opened)
-    located = locate(cloud, opened, chosen, progress)
-    cut = cut_out(opened, located.box)
-    steps = [_in_survey(stage, located, cut) for stage in steps_of(chosen)]
-    nodes = [*chained([MemoryReader(cut, "target")]), *chained([reader])]
-    nodes += chained(steps, ("target", "source"))
-    if out is None:
-        return Registration(run(nodes, progress=progress), chosen)
-    nodes += chained(writers, (nodes[-1].tag,))
-    earlier = further_files(Path(out))
-    return Registration(run(nodes, overwrite=chosen.overwrite, progress=progress, replaces=earlier), chosen)
+    with cores(chosen.threads):
+        located = locate(cloud, opened, chosen, progress)
+        cut = cut_out(opened, located.box)
+        steps = [_in_survey(stage, located, cut) for stage in steps_of(chosen)]
+        nodes = [*chained([MemoryReader(cut, "target")]), *chained([reader])]
+        nodes += chained(steps, ("target", "source"))
+        if out is None:
+            return Registration(run(nodes, progress=progress), chosen)
+        nodes += chained(writers, (nodes[-1].tag,))
+        earlier = further_files(Path(out))
+        result = run(nodes, overwrite=chosen.overwrite, progress=progress, replaces=earlier)
+    return Registration(result, chosen)
 
 
 def _in_survey(stage: Stage, located: Located, cut: CutOut) -> Stage:

@@ -127,10 +127,10 @@ def _refinement(evidence: Evidence, limits: Limits) -> Check:
     lost = "; surfaces fit better where they do not agree" if evidence.refinement_lost else ""
     return Check(
         "refinement",
-        f"moved {value} m{kept}{lost}",
+        f"{value} m away{kept}{lost}",
         f"at most {wanted} m, tie points kept",
         True,
-        "how far ICP moved the middle of the tie points in plan from where these had led.",
+        "how far the refinement ended from where the tie points had led, in plan, at the middle of these.",
     )
 
 

@@ -38,7 +38,7 @@ class Evidence:
             grounds, relief that they have, and spread that their noise explains, metres, see
             `method.overlap.GroundShape`; None where it was not to be told.
         repeats: whether the scene under the pose fits itself after a shift, as rows do.
-        refined_away_m: how far the refinement moved the overlap from the solution in plan, metres.
+        refined_away_m: how far the refinement ended from where the tie points had led, in plan, metres.
         final_agreeing: of all tie points, those that agree with the final transform; None if not counted.
         refinement_lost: whether surfaces fit better where the tie points do not agree, and the tie points
             were followed.

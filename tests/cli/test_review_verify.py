@@ -123,6 +123,15 @@ def test_a_changed_result_is_found(copy):
     assert kinds(found).count(("file", "audit.rrd")) == 2
 
 
+def test_a_verdict_that_was_made_better_in_the_transform_is_found(copy):
+    path = copy / "out" / "transform.json"
+    verdict = json.loads(path.read_text())["verdict"]
+    change(path, verdict=verdict | {"name": "doubtful" if verdict["name"] == "accepted" else "accepted"})
+    code, found = verify(copy / "out")
+    assert code == EXIT_DIFFERENT
+    assert kinds(found) == [("file", "transform.json")]
+
+
 @pytest.mark.parametrize("spoil", ["no record", "no json", "another json", "gone"])
 def test_what_cannot_be_verified_is_said_in_a_line(copy, spoil):
     path = copy / "out" / "run.json"

@@ -18,6 +18,7 @@ from mtpcr_geo.method.refine import (
     fine_voxel,
     follow_icp,
     refine,
+    target_moves,
 )
 from mtpcr_geo.method.settle import settle_on_ground
 from mtpcr_geo.verdict.evidence import gather, tie_points_agreeing
@@ -81,6 +82,13 @@ def test_exchanged_clouds_are_refined_to_the_inverse(clouds) -> None:
     # fewer degrees of freedom are those of the source, whichever cloud that is
     flat = refine(target, source, transforms.inverse(start), RefineSettings(motion="translation"))
     assert np.allclose(flat.T[:3, :3], np.eye(3), atol=1e-12)
+
+
+def test_the_same_of_two_clouds_moves_whichever_is_the_source(clouds) -> None:
+    one, other = clouds[0], clouds[1] * [1.0, 1.1, 1.0]
+    assert target_moves(one, other) is not target_moves(other, one)
+    assert target_moves(one, other[1:])
+    assert not target_moves(one[1:], other)
 
 
 def test_icp_is_the_same_at_each_run(clouds) -> None:
@@ -203,6 +211,9 @@ def test_icp_that_loses_the_ties_is_followed_where_that_is_asked_or_few_agreed(
     assert refined.refinement.icp is not None
     assert refined.refinement.icp.followed is followed
     assert refined.refinement.icp.lost_tie_points is not followed
+    left = followed and keep_tie_points > 0.0
+    assert refined.refinement.icp.left_tie_points is left
+    assert refined.refinement.icp.contested is (left or not followed)
     assert tie_points_agreeing(refined, refined.T_target_source) == (0 if followed else count)
     plan = np.linalg.norm(refined.T_target_source[:2, 3])
     assert plan < 0.05 if followed else plan == pytest.approx(np.hypot(2.2, 1.2), abs=0.05)

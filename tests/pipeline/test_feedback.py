@@ -15,8 +15,14 @@ from mtpcr_geo.core.types import Bev, Pair, Side
 from mtpcr_geo.export.descriptions import transform_rows
 from mtpcr_geo.method.bev import make_bev
 from mtpcr_geo.method.refine import RefineSettings, refine
-from mtpcr_geo.pipeline.stages.feedback import CLOSER, borne_out, matched_coarser, refined_from_search
-from mtpcr_geo.verdict.evidence import tie_points_agreeing
+from mtpcr_geo.pipeline.stages.feedback import (
+    CLOSER,
+    _apart_m,
+    borne_out,
+    matched_coarser,
+    refined_from_search,
+)
+from mtpcr_geo.verdict.evidence import gather, tie_points_agreeing
 
 
 def refined(residual: float, *, followed: bool, lost: bool) -> Refinement:
@@ -116,6 +122,34 @@ def test_the_pose_of_the_search_is_refined_where_tie_points_lead_elsewhere(regis
     assert refined_from_search(rows, refined, RefineSettings()) is None, "a row away surfaces meet as well"
     assert found.again is not None
     assert apart_m(found.T, T) < 0.03
+    # the checks hear how far that is from where the tie points had led, not from where the search had
+    assert found.T_solved is off.T_target_source
+    assert off.T_target_source is not None
+    after = off.with_(T_target_source=found.T, refinement=found)
+    evidence, _ = gather(after)
+    assert evidence.refined_away_m == pytest.approx(np.hypot(3.0, 2.0), abs=0.1)
+
+
+def test_the_pose_of_the_search_is_refined_only_where_it_was_judged_and_may_move_freely(registered) -> None:
+    pair, T = registered
+    off, refined = beside(pair, T, (3.0, 2.0, 0.5))
+    off = few_of(off)
+    for motion in ("yaw", "translation"):
+        assert refined_from_search(off, refined, RefineSettings(motion=motion)) is None
+    assert off.matches is not None
+    keypoints = replace(off.matches, matcher=replace(off.matches.matcher, needs_image=True))
+    assert refined_from_search(off.with_(matches=keypoints), refined, RefineSettings()) is None
+
+
+def test_steps_between_two_transforms_are_as_long_with_source_and_target_exchanged(registered) -> None:
+    pair, T = registered
+    turned = transforms.compose(transforms.yaw_matrix(0.05), np.array([2.0, 1.0, 0.3])) @ T
+    other = replace(pair.tie_points, source=pair.tie_points.target, target=pair.tie_points.source)
+    exchanged = pair.with_(source=pair.target, target=pair.source, tie_points=other)
+    there = _apart_m(pair, T, turned)
+    back = _apart_m(exchanged, transforms.inverse(T), transforms.inverse(turned))
+    assert there == pytest.approx(back, abs=1e-9)
+    assert there > 1.0
 
 
 def test_the_pose_of_the_search_stays_out_where_it_is_the_same_or_surfaces_meet_no_better(registered) -> None:

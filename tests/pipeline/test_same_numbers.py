@@ -169,7 +169,7 @@ def test_every_place_says_the_same(name: str, force: bool, tmp_path: Path) -> No
     assert check["tie points"].startswith(
         f"{known['held_out_tie_points']}, of which {known['held_out_agreeing']} agree when held out"
     )
-    assert f"moved {known['refined_away_m']:.2f} m" in check["refinement"]
+    assert f"{known['refined_away_m']:.2f} m away" in check["refinement"]
     assert f" of {known['ground_cells']:,} cells" in check["ground heights"]
     share = float(check["ground heights"].partition(" %")[0])
     assert share == pytest.approx(100.0 * known["ground_agreeing"] / known["ground_cells"], abs=0.5)

@@ -75,6 +75,14 @@ def test_a_table_that_is_wrong_is_refused(
         jobs_of(write_table(tmp_path, *rows), None, {})
 
 
+def test_recordings_are_written_where_they_are_asked_for(clouds: Path) -> None:
+    table = write_table(clouds, "source,target,recording", "scan.laz,target.laz,yes", "scan2.laz,target.laz,")
+    first, second = jobs_of(table, None, {})
+    assert first.options == {"recording": True}
+    assert second.options == {}  # none, in a batch
+    assert [job.options for job in jobs_of(table, None, {"recording": True})] == [{"recording": True}] * 2
+
+
 def test_a_name_is_no_path(tmp_path: Path) -> None:
     table = write_table(tmp_path, "name,source,target", "../../x y,a.laz,b.laz")
     assert jobs_of(table, None, {})[0].name == "_.._x_y"

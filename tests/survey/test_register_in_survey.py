@@ -13,6 +13,7 @@ from helpers_survey import ETRS, tiles_of, town_source, town_target, write_tile
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import InputError, OptionError, RegistrationError
+from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import Matches
 from mtpcr_geo.export import run_json
 from mtpcr_geo.match.candidates import Candidate, Pool
@@ -20,6 +21,7 @@ from mtpcr_geo.match.patches import PatchMatches
 from mtpcr_geo.match.pose import Pose
 from mtpcr_geo.method.scales import scales_for
 from mtpcr_geo.registration import Registration
+from mtpcr_geo.survey import register
 from mtpcr_geo.survey.build import build_survey
 from mtpcr_geo.survey.cut import cut_out
 from mtpcr_geo.survey.index import Survey
@@ -88,6 +90,21 @@ def test_a_scan_is_found_and_registered_to_the_points(
     assert read == {"tile0.laz", "tile1.laz", "tile2.laz", "tile3.laz"}
     assert record.metadata["margin"] <= record.metadata["survey"]["margin"]
     assert record.metadata["null_ratio"] <= record.metadata["survey"]["null_ratio"]
+
+
+def test_the_number_of_threads_holds_for_the_search_too(
+    source: tuple[Path, np.ndarray], survey: Survey, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+
+    def spy(*arguments: Any) -> Any:
+        seen.append(usable_cores())
+        raise RegistrationError("that is all")
+
+    monkeypatch.setattr(register, "locate", spy)
+    with pytest.raises(RegistrationError, match="that is all"):
+        register_in_survey(source[0], survey.folder, source_crs="local", threads=1)
+    assert seen == [1]
 
 
 def test_the_run_is_on_record(found: Registration, survey: Survey) -> None:

@@ -30,9 +30,24 @@ from mtpcr_geo.core.cloud import ArrayCloud
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.voxels import first_in_voxels
 
-__all__ = ["KINDS", "Kind", "SimulatedPair", "describe", "simulate_from", "simulate_pair", "write_pair"]
+__all__ = [
+    "KINDS",
+    "Kind",
+    "NothingSeenError",
+    "SimulatedPair",
+    "describe",
+    "simulate_from",
+    "simulate_pair",
+    "write_pair",
+]
 
 TARGET_EPSG = 25832
+
+
+class NothingSeenError(OptionError):
+    """With these options one of the scans sees nothing of the site."""
+
+
 # parts of the ground scan (of its time) tried in turn until the shares come out as asked
 _SHORTER = (
     (0.0, 1.0),
@@ -84,7 +99,8 @@ def simulate_pair(kind: Kind, seed: int = 0, **options: Any) -> SimulatedPair:
         options: further fields of `PairOptions`.
 
     Raises:
-        OptionError: if an option is unknown or out of its range, or one of the scans sees nothing.
+        OptionError: if an option is unknown or out of its range.
+        NothingSeenError: if one of the scans sees nothing.
         MissingPartError: if ``embreex`` is not installed.
 
     """
@@ -112,7 +128,7 @@ def simulate_from(options: PairOptions) -> SimulatedPair:
     if options.voxel_m > 0:
         low = low.part(first_in_voxels(low.xyz, options.voxel_m))
     if not low.extra["GpsTime"].size:
-        raise OptionError(
+        raise NothingSeenError(
             f"the ground scan of {kind} {seed} saw nothing; send more beams than {options.ground_beams}"
         )
 
@@ -126,7 +142,7 @@ def simulate_from(options: PairOptions) -> SimulatedPair:
     )
     high = high.part(block.contains(high.xyz[:, :2]))
     if not high.extra["GpsTime"].size:
-        raise OptionError(
+        raise NothingSeenError(
             f"the aerial scan of {kind} {seed} saw nothing; take a larger overlap than {options.overlap:g}"
         )
 

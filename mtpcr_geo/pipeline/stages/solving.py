@@ -133,7 +133,7 @@ class RefineOptions(StageOptions):
     method: Literal["gicp", "point_to_plane", "point_to_point", "none"] = Field(
         "gicp", description="ICP variant; point_to_point is what the paper cites"
     )
-    voxel: float = Field(0.5, gt=0, description="thinning of the points, metres; grows with large overlaps")
+    voxel: float = Field(0.5, gt=0, description="thinning of the points, metres")
     max_correspondence_distance: list[float] | None = Field(
         None,
         min_length=1,
