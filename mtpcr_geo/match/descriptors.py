@@ -7,8 +7,11 @@ them on graphics cards too and lets a description file say what a model's inputs
 
 from __future__ import annotations
 
+import hashlib
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from threading import Lock
 from typing import Protocol
 
 import cv2
@@ -29,6 +32,39 @@ class Extractor(Protocol):
 
     def extract(self, image: Grey, empty: int = 0) -> Features:
         """Find keypoints in a (h, w) uint8 image, extended by ``empty`` where need be."""
+
+
+REMEMBERED = 20
+"""Images of which features are kept: a target, and a source and its mirror image in eight orientations."""
+
+
+class Remembering:
+    """An `Extractor` that describes an image once, and remembers the last ones.
+
+    Args:
+        extractor: which does the work; it is asked from several threads.
+
+    """
+
+    def __init__(self, extractor: Extractor) -> None:
+        self._extractor = extractor
+        self._known: OrderedDict[tuple[bytes, tuple[int, ...], int], Features] = OrderedDict()
+        self._lock = Lock()
+
+    def extract(self, image: Grey, empty: int = 0) -> Features:
+        """Find keypoints in a (h, w) uint8 image, or return those that were found before."""
+        key = hashlib.blake2b(image.tobytes()).digest(), image.shape, empty
+        with self._lock:
+            found = self._known.pop(key, None)
+            if found is not None:
+                self._known[key] = found
+                return found
+        found = self._extractor.extract(image, empty)
+        with self._lock:
+            self._known[key] = found
+            while len(self._known) > REMEMBERED:
+                self._known.popitem(last=False)
+        return found
 
 
 class Pairing(Protocol):

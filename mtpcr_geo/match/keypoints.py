@@ -7,6 +7,7 @@ metres; those of a wrong one do not. Cells may differ in size: both images are b
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
@@ -80,6 +81,7 @@ class KeypointMatcher:
             all at once.
         sweep_to: edge that images are shrunk to, by a whole factor, for comparing orientations, pixels; 0 for
             never.
+        workers: orientations described at once, where all are looked at before one is chosen.
         candidates: partners of a keypoint that vote for a pose, see `mtpcr_geo.match.votes`; 0 for poses by
             consensus of the matches alone. Only for a `FeatureMatcher` with descriptors of unit length.
 
@@ -93,6 +95,7 @@ class KeypointMatcher:
     sweep_keypoints: int | None = None
     sweep_to: int = 0
     candidates: int = 0
+    workers: int = 1
     needs_image: bool = field(default=True, init=False)
     needs_one_cell: bool = field(default=False, init=False)
 
@@ -213,18 +216,17 @@ class KeypointMatcher:
         """
         target_px = shrunk(prepared[0].px, zoom)
         frame = Frame(source.grid, target.grid, zoom, tolerance)
-        orientations, turned = [], []
-        for turn in turns:
-            one = Turned.of(image, source.empty, turn, self.images)
-            orientations.append(self._candidates_of(one, prepared[0], zoom, turn, source.grid))
-            turned.append(one)
-            advance(1)
+        turned = self._turned(image, source.empty, turns, advance)
+        orientations = [
+            self._candidates_of(one, prepared[0], zoom, turn, source.grid)
+            for turn, one in zip(turns, turned, strict=True)
+        ]
         voted = posed(turns, turned, orientations, prepared[0], frame)
         keypoints = max(len(one.source) for one in orientations), len(target_px)
         if not voted or not len(voted[0].found):
             raise RegistrationError(self._nothing(keypoints, image.size))
         flipped = np.ascontiguousarray(image[:, ::-1])
-        others = [Turned.of(flipped, source.empty, turn, self.images) for turn in turns]
+        others = self._turned(flipped, source.empty, turns, advance)
         mirrored = posed(
             turns,
             others,
@@ -277,6 +279,15 @@ class KeypointMatcher:
             source_keypoints=found.source_keypoints,
             target_keypoints=found.target_keypoints,
         )
+
+    def _turned(self, image: Grey, empty: int, turns: list[float], advance: Advance) -> list[Turned]:
+        """Turn an image and prepare it in every orientation, several at once."""
+        done = []
+        with ThreadPoolExecutor(self.workers) as pool:
+            for one in pool.map(lambda turn: Turned.of(image, empty, turn, self.images), turns):
+                done.append(one)
+                advance(1)
+        return done
 
     def _candidates_of(
         self, turned: Turned, target: Features, zoom: float, turn: float, grid: Grid

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, cast
 
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.system import usable_cores
@@ -17,7 +17,7 @@ from mtpcr_geo.match.prior import Prior
 if TYPE_CHECKING:
     # of matchers by keypoints; the default one does without, and is not to wait for them
     from mtpcr_geo.match.base import ImageMatcher
-    from mtpcr_geo.match.descriptors import Extractor
+    from mtpcr_geo.match.descriptors import Extractor, FeatureMatcher
     from mtpcr_geo.match.keypoints import KeypointMatcher
     from mtpcr_geo.match.learned.proposals import LearnedProposals
 
@@ -133,25 +133,53 @@ def _by_keypoints(name: str, keypoints: KeypointSettings) -> KeypointMatcher:
     )
 
 
-def learned_proposals(threads: int = 0, name: str = "bev") -> LearnedProposals:
-    """Make what proposes poses to the correlation search; its file is opened once it is asked.
+@dataclass
+class Network:
+    """The network in the package: it proposes poses and matches, and describes each image once for both.
 
-    Args:
+    Its files are opened once they are needed.
+
+    Attributes:
         threads: orientations described at once; as many as there are cores if 0.
         name: of a model in the package that describes all places of an image (`map_stride`).
 
     """
-    from mtpcr_geo.match.learned.proposals import LearnedProposals
 
-    def opened() -> Extractor:
-        from mtpcr_geo.match.learned.onnx import OnnxExtractor, Running
+    threads: int = 0
+    name: str = "bev"
+    _images: FeatureMatcher | None = field(default=None, init=False, repr=False)
 
-        model = descriptions(None)[name]
+    def images(self) -> FeatureMatcher:
+        """Return what describes images and pairs their keypoints."""
+        if self._images is None:
+            from mtpcr_geo.match.descriptors import Remembering
+
+            # one thread for each orientation, so that no sum depends on how many there are
+            settings = KeypointSettings(device="cpu", threads=1)
+            made = cast("FeatureMatcher", _learned(descriptions(None)[self.name], None, settings))
+            self._images = replace(made, extractor=Remembering(made.extractor))
+        return self._images
+
+    def proposals(self) -> LearnedProposals:
+        """Return what proposes poses to the correlation search."""
+        from mtpcr_geo.match.learned.proposals import LearnedProposals
+
+        return LearnedProposals(lambda: self.images().extractor, self.threads or usable_cores())
+
+    def matcher(self) -> KeypointMatcher:
+        """Return the matcher of whole rasters."""
+        from mtpcr_geo.match.keypoints import KeypointMatcher
+
+        model = descriptions(None)[self.name]
         assert model.extractor is not None
-        # one thread for each orientation, so that no sum depends on how many there are
-        return OnnxExtractor(model.extractor, path_of(model.extractor.file, model, None), Running("cpu", 1))
-
-    return LearnedProposals(opened, threads or usable_cores())
+        return KeypointMatcher(
+            self.name,
+            self.images(),
+            turns=model.turns,
+            magnify_to=model.extractor.magnify_to,
+            candidates=model.extractor.candidates,
+            workers=self.threads or usable_cores(),
+        )
 
 
 def _classical(name: str, settings: KeypointSettings) -> ImageMatcher:

@@ -33,6 +33,8 @@ import numpy as np
 from mtpcr_geo.core.types import Bev
 from mtpcr_geo.method.bev import OCCUPANCY_CELL_M, coarsen
 
+FINEST_OF_LEARNED_M = 0.5
+"""Finest cell of rasters for learned matchers: their weights know hardly any finer."""
 MAX_PATCH_M, MIN_PATCH_CELLS = 24.0, 12
 FEWEST_FILLED_IN_PATCH = 40
 """Cells filled in both rasters that a patch should hold: fewer do not tell one place from the next."""

@@ -32,12 +32,13 @@ from mtpcr_geo.match.search import angle_between
 from mtpcr_geo.pipeline.options import RegisterOptions
 from mtpcr_geo.pipeline.runner import run
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, Value, chained
-from mtpcr_geo.pipeline.stages.matching import Match, MatchOptions, view_of
+from mtpcr_geo.pipeline.stages.matching import Match, MatchOptions
 from mtpcr_geo.pipeline.stages.memory import MemoryReader
 from mtpcr_geo.pipeline.stages.pairs import bevs_of
 from mtpcr_geo.pipeline.stages.priors import audit_of, known_place
 from mtpcr_geo.pipeline.stages.rasters import Level, LevelOptions
 from mtpcr_geo.pipeline.stages.steps import further_files, reader_of, steps_of, writers_for
+from mtpcr_geo.pipeline.stages.views import view_of
 from mtpcr_geo.registration import Registration, read_options
 from mtpcr_geo.survey.cut import CutOut, cut_out
 from mtpcr_geo.survey.index import Survey

@@ -13,7 +13,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.types import Bev, Hypothesis
 from mtpcr_geo.match.correlation import CorrelationSettings, match
 from mtpcr_geo.match.learned.proposals import COARSEST_CELL_M, LONGEST_PX, PROPOSED
-from mtpcr_geo.match.registry import learned_proposals
+from mtpcr_geo.match.registry import Network
 from mtpcr_geo.method.bev import grid_around, rasterise
 
 
@@ -144,7 +144,7 @@ def test_the_network_proposes_the_same_on_any_number_of_threads(
     strip: tuple[Bev, Bev, Hypothesis],
 ) -> None:
     source, target, _ = strip
-    one, two = (learned_proposals(threads).poses(source, target) for threads in (1, 2))
+    one, two = (Network(threads).proposals().poses(source, target) for threads in (1, 2))
     assert one == two
     assert 0 < len(one) <= PROPOSED
     assert [pose.score for pose in one] == sorted((pose.score for pose in one), reverse=True)
@@ -157,4 +157,4 @@ def test_the_network_proposes_nothing_where_its_cells_would_be_too_coarse() -> N
     far = np.array([[0.0, 0.0, 0.0], [1.3 * LONGEST_PX * cell, 10.0, 0.0]])
     sparse = bev_of(np.vstack([far, rng.uniform(0.0, 50.0, (200, 3))]), cell)
     assert 2 * cell > COARSEST_CELL_M
-    assert learned_proposals(1).poses(sparse, sparse) == []
+    assert Network(1).proposals().poses(sparse, sparse) == []

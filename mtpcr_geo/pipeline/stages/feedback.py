@@ -23,7 +23,7 @@ from mtpcr_geo.method.inverse_mapping import tie_points_of
 from mtpcr_geo.method.refine import FEW_TIE_POINTS, RefineSettings, refine, target_moves
 from mtpcr_geo.method.scales import tolerance_for
 from mtpcr_geo.method.solve import solve_tie_points
-from mtpcr_geo.pipeline.stages.matching import shown, view_of
+from mtpcr_geo.pipeline.stages.views import shown, view_of
 from mtpcr_geo.verdict.evidence import middle_of_tie_points, moved_in_plan, tie_points_agreeing
 
 LEAST_TILT_DEG = 0.3

@@ -12,15 +12,17 @@ from pydantic import Field
 
 from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.core.system import core_limit
-from mtpcr_geo.core.types import Appearance, Bev, Look, Pair, Side
+from mtpcr_geo.core.types import Appearance, Look, Pair, Side
 from mtpcr_geo.pipeline.options import AskProposals, MatcherName, Models, PriorOptions, Seed, Threads
 from mtpcr_geo.pipeline.stage import OptionsModel, RunContext, Stage, StageOptions, Value
 from mtpcr_geo.pipeline.stages.pairs import bevs_of
 from mtpcr_geo.pipeline.stages.priors import audit_of, known_place, prior_of
+from mtpcr_geo.pipeline.stages.views import look_of, shown, view_as, view_of
 
 if TYPE_CHECKING:
-    from mtpcr_geo.match.base import Matcher, View
+    from mtpcr_geo.match.base import Matcher
     from mtpcr_geo.match.prior import Prior
+    from mtpcr_geo.match.registry import Network
 
 _FOR_CORRELATION = {"yaw_step", "patch", "search_radius", "min_overlap", "proposals"}
 _FOR_KEYPOINTS = {
@@ -149,6 +151,7 @@ class Match(Stage):
     options: MatchOptions
 
     _matcher: Matcher | None = None
+    _network: Network | None = None
 
     def reads(self) -> list[Path]:
         """Return the file of the prior, if there is one."""
@@ -178,8 +181,10 @@ class Match(Stage):
         pair = self.one_pair(inputs)
         bevs_of(self, pair)
         known = known_place(self.options, pair, self.label)
-        if not self.options.verticals or pair.raster is None or known is not None:
+        if known is not None:
             return self._matched(pair, context)
+        if not self.options.verticals or pair.raster is None:
+            return self._or_by_network(self._matched(pair, context), context)
         raster = pair.raster
         upright = pair.source.levelling.trusted and pair.target.levelling.trusted
         pair, tried = best_vertical(
@@ -197,7 +202,35 @@ class Match(Stage):
         self.metadata |= {"matches": len(matches.score), **matches.report}
         if tried:
             self.metadata["verticals"] = tried
-        return pair.with_(matches=matches)
+        return self._or_by_network(pair.with_(matches=matches), context)
+
+    def _or_by_network(self, pair: Pair, context: RunContext) -> Pair:
+        """Return the pair as the network matches it, where the search by heights can't be accepted."""
+        from mtpcr_geo.pipeline.stages.second_opinion import is_doubted, is_weak, matched_by_network
+
+        options, first = self.options, pair.matches
+        assert first is not None
+        if options.method != "correlation" or not options.proposals:
+            return pair
+        if not (is_doubted(first) or is_weak(first)):
+            return pair
+        with context.progress.task("asking the network", None) as advance:
+            network = self._asked(options.threads or core_limit())
+            found, margin = matched_by_network(pair, options.seed, network, advance)
+        if found is not None and found.matches is not None:
+            kept = {name: self.metadata[name] for name in ("verticals",) if name in self.metadata}
+            self.metadata.clear()
+            self.metadata |= {"matches": len(found.matches), **found.matches.report, **kept}
+        self.metadata["second_opinion"] = {"margin": margin, "taken": found is not None}
+        return pair if found is None else found
+
+    def _asked(self, threads: int) -> Network:
+        """Return the network, one for all questions of this stage."""
+        from mtpcr_geo.match.registry import Network
+
+        if self._network is None:
+            self._network = Network(threads)
+        return self._network
 
     def _matched(self, pair: Pair, context: RunContext, *, provisional: bool = False) -> Pair:
         source, target = bevs_of(self, pair)
@@ -243,7 +276,6 @@ class Match(Stage):
         from mtpcr_geo.match.registry import (
             CorrelationMatcher,
             KeypointSettings,
-            learned_proposals,
             make_matcher,
         )
 
@@ -255,7 +287,7 @@ class Match(Stage):
             search_radius_m=o.search_radius,
             min_overlap_m2=o.min_overlap,
             trust_vertical=trust_vertical,
-            proposals=learned_proposals(threads) if o.proposals and first else None,
+            proposals=self._asked(threads).proposals() if o.proposals and first else None,
         )
         if o.method == "correlation":
             return CorrelationMatcher(correlation, prior, provisional)
@@ -306,14 +338,14 @@ class Focus(Stage):
         if first is None or first.matcher is None:
             raise OptionError(f"{self.label} needs matches; put mtpcr.match before it")
         matcher = first.matcher
-        look = _look_of(pair.source) if matcher.needs_image else None
+        look = look_of(pair.source) if matcher.needs_image else None
         settings = FocusSettings(
             self.options.theta, self.options.finer, self.options.radius, self.options.finest
         )
         with context.progress.task("matching again", None) as advance:
             matches = focus(
                 lambda s, t, yaw: matcher.match(
-                    _view(s, look), _view(t, look), seed=self.options.seed, yaw=yaw, advance=advance
+                    view_as(s, look), view_as(t, look), seed=self.options.seed, yaw=yaw, advance=advance
                 ),
                 first,
                 Subject(pair.source.levelled_sample, source.grid),
@@ -323,37 +355,3 @@ class Focus(Stage):
             )
         self.metadata |= matches.report["focus"]
         return pair.with_(matches=matches)
-
-
-def shown(side: Side) -> Side:
-    """Return the side with an image of its raster, so that what was matched is on record."""
-    from mtpcr_geo.method.images import grey, image_of
-
-    assert side.bev is not None
-    known = side.appearance
-    if known is not None and known.image.shape == side.bev.grid.shape:
-        return side
-    look = _look_of(side)
-    return replace(side, appearance=Appearance(look, grey(side.bev), image_of(side.bev, look)))
-
-
-def view_of(side: Side, with_image: bool) -> View:
-    """Return what a matcher sees of a side: its raster, and its image where one is wanted."""
-    from mtpcr_geo.match.base import View
-    from mtpcr_geo.method.images import empty_grey
-
-    assert side.bev is not None
-    seen = shown(side).appearance if with_image else None
-    return View(side.bev) if seen is None else View(side.bev, seen.image, empty_grey(seen.look))
-
-
-def _view(bev: Bev, look: Look | None) -> View:
-    from mtpcr_geo.match.base import View
-    from mtpcr_geo.method.images import empty_grey, image_of
-
-    return View(bev) if look is None else View(bev, image_of(bev, look), empty_grey(look))
-
-
-def _look_of(side: Side) -> Look:
-    # a pipeline without mtpcr.enhance shows band-passed heights
-    return side.appearance.look if side.appearance is not None else "band_pass"

@@ -74,6 +74,10 @@ class InverseMapping(Stage):
         return pair.with_(tie_points=tie_points)
 
 
+TRIES, MANY_TRIES = 2000, 20_000
+"""Pairs of tie points tried for a robust start; with keypoint matchers, of whose matches 2 % may be right."""
+
+
 class SolveOptions(StageOptions):
     """Options of mtpcr.solve."""
 
@@ -88,10 +92,11 @@ class SolveOptions(StageOptions):
         description="start from the yaw and shift most tie points agree on (RANSAC); else from all (the "
         "paper)",
     )
-    tries: int = Field(
-        2000,
+    tries: int | None = Field(
+        None,
         ge=1,
-        description="pairs of tie points tried for the robust start; more where few of them are right",
+        description="pairs of tie points tried for the robust start; if not given 2,000, or 20,000 with "
+        "keypoint matchers, of whose matches few may be right",
     )
     seed: Seed = 0
 
@@ -115,7 +120,9 @@ class Solve(Stage):
         tie_points = pair.tie_points
         tolerance = self.options.tolerance or 1.5 * tolerance_for(pair.cell)
         options = self.options
-        settings = SolveSettings(options.robust_start, options.upright, options.tries, options.seed)
+        matcher = None if pair.matches is None else pair.matches.matcher
+        tries = options.tries or (MANY_TRIES if matcher is not None and matcher.needs_image else TRIES)
+        settings = SolveSettings(options.robust_start, options.upright, tries, options.seed)
         try:
             solution, inlier = solve_tie_points(tie_points, tolerance, settings)
         except RegistrationError as error:

@@ -18,6 +18,7 @@ from mtpcr_geo.io.memory import cloud_of
 from mtpcr_geo.io.write import is_copc
 from mtpcr_geo.io.write_any import ENDINGS
 from mtpcr_geo.match.learned.model_cards import look_of, models_folder
+from mtpcr_geo.method.scales import FINEST_OF_LEARNED_M
 from mtpcr_geo.pipeline.file_options import AlsoFormat
 from mtpcr_geo.pipeline.options import OUTPUT_NAMES, MethodOptions, PriorOptions, RegisterOptions
 from mtpcr_geo.pipeline.stage import Stage
@@ -74,11 +75,6 @@ from mtpcr_geo.pipeline.stages.solving import (
 if TYPE_CHECKING:
     from mtpcr_geo.io.memory import CloudLike
 
-MANY_TRIES = 20_000
-"""Pairs of tie points tried for the robust start with keypoint matchers: few matches may be right."""
-FINEST_OF_LEARNED_M = 0.5
-"""Finest cell chosen for learned keypoints, which like fine detail where the points are dense enough."""
-
 
 def steps_of(options: MethodOptions, prefix: str = "") -> list[Stage]:
     """Make the stages from levelling to verdict, each tagged by its step.
@@ -116,19 +112,17 @@ def _method(options: MethodOptions, prefix: str) -> list[Stage]:
             raise OptionError(f"--no-{name} belongs to --profile paper")
     seed = options.seed
     matcher = options.matcher or "correlation"
-    by_keypoints = matcher != "correlation"
-    learned = by_keypoints and matcher not in ("rootsift", "orb")
+    learned = matcher not in ("correlation", "rootsift", "orb")
     bev = (
         BevOptions(cell=options.cell, finest=FINEST_OF_LEARNED_M)
         if learned
         else BevOptions(cell=options.cell)
     )
-    solve = SolveOptions(tries=MANY_TRIES, seed=seed) if by_keypoints else SolveOptions(seed=seed)
     return [
         MakeBev(bev, f"{prefix}bev"),
         Match(_match_options(options, matcher), f"{prefix}match"),
         InverseMapping(InverseMappingOptions(seed=seed), f"{prefix}inverse_mapping"),
-        Solve(solve, f"{prefix}solve"),
+        Solve(SolveOptions(seed=seed), f"{prefix}solve"),
         Refine(RefineOptions(motion=options.motion), f"{prefix}refine"),
         Assess(AssessOptions(), f"{prefix}assess"),
     ]
@@ -170,7 +164,7 @@ def _paper_method(options: MethodOptions, prefix: str) -> list[Stage]:
     solve = (
         SolveOptions(upright=False, robust_start=False, seed=seed)
         if trained_on is None
-        else SolveOptions(tries=MANY_TRIES, seed=seed)
+        else SolveOptions(seed=seed)
     )
     # tie points of a small network are off by a cell or two, and point-to-point ICP stops short from there
     refine = (

@@ -1,0 +1,109 @@
+"""A second matcher, where the search by heights cannot be believed: the network's own tie points.
+
+Where little is shared between the ground and the air, patches of heights agree under no pose, the right one
+included. Descriptors of all places tell it still: under the right pose they say several times what they say
+under any other. They are asked once the search has failed, and what they find is solved, refined and judged
+as of any keypoint matcher.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.errors import RegistrationError
+from mtpcr_geo.core.types import Matches, Pair
+from mtpcr_geo.match.base import Advance
+from mtpcr_geo.match.correlation import exchanged
+from mtpcr_geo.match.learned.proposals import COARSEST_CELL_M, LONGEST_PX
+from mtpcr_geo.match.pose import centre_of, pose_of
+from mtpcr_geo.match.registry import Network
+from mtpcr_geo.match.search import angle_between
+from mtpcr_geo.method.bev import coarsen
+from mtpcr_geo.method.scales import FINEST_OF_LEARNED_M
+from mtpcr_geo.pipeline.stages.views import shown, view_of
+from mtpcr_geo.verdict.limits import Limits
+
+SAME_M, SAME_DEG = 5.0, 5.0
+"""Plan distance of the source's middle, and yaw, within which both matchers found the same pose."""
+
+
+def is_doubted(matches: Matches) -> bool:
+    """Return whether matches of the search by heights cannot be accepted, whatever is made of them.
+
+    Not where the scene repeats itself: one row looks like the next to the network too.
+    """
+    limits = Limits()
+    if matches.repeats:
+        return False
+    if matches.margin is None or matches.margin < limits.margin:
+        return True
+    return matches.null_ratio is not None and matches.null_ratio < limits.null_ratio
+
+
+def is_weak(matches: Matches) -> bool:
+    """Return whether hardly more patches agree with the best pose of the search than by chance."""
+    significance = matches.report.get("neg_log10_p")
+    return not matches.repeats and significance is not None and significance < Limits().neg_log10_p
+
+
+def matched_by_network(
+    pair: Pair, seed: int, network: Network, advance: Advance
+) -> tuple[Pair | None, float | None]:
+    """Match a pair by the network in the package.
+
+    Args:
+        pair: matched by heights, with rasters of one cell.
+        seed: of the matcher.
+        network: which has described the rasters already, if it proposed poses to the search.
+        advance: called with 1 after each orientation.
+
+    Returns:
+        The pair with rasters of cells that the network knows and matches of it, or None where its best pose
+        does not stand out from the next and from the mirrored source's, there is nothing to match, or the
+        search by heights, whose margins are enough, had found the same; and how many times stronger that
+        pose is, None if there is none.
+
+    """
+    source, target, first = pair.source.bev, pair.target.bev, pair.matches
+    assert source is not None
+    assert target is not None
+    assert first is not None
+    cell, longest = target.grid.cell, max(*source.grid.shape, *target.grid.shape)
+    factor = int(max(-(-FINEST_OF_LEARNED_M // cell), -(-longest // LONGEST_PX), 1))
+    if factor * cell > COARSEST_CELL_M:
+        return None, None
+    sides = [
+        shown(replace(side, bev=coarsen(bev, factor), appearance=None))
+        for side, bev in ((pair.source, source), (pair.target, target))
+    ]
+    matcher = network.matcher()
+    views = [view_of(side, True) for side in sides]
+    # of two clouds it is the smaller one that is turned, whichever is the source
+    back = bool((source.count > 0).sum() > (target.count > 0).sum())
+    try:
+        found = matcher.match(*(views[::-1] if back else views), seed=seed, advance=advance)
+    except RegistrationError:
+        return None, None  # a second opinion never costs the first
+    if back:
+        found = replace(
+            exchanged(found),
+            source_keypoints=found.target_keypoints,
+            target_keypoints=found.source_keypoints,
+        )
+    elsewhere = not _same(first, found, centre_of(source.grid))
+    if found.margin is None or found.margin < Limits().margin or not (is_doubted(first) or elsewhere):
+        return None, found.margin
+    return (
+        pair.with_(source=sides[0], target=sides[1], matches=replace(found, matcher=matcher)),
+        found.margin,
+    )
+
+
+def _same(one: Matches, other: Matches, middle: Floats) -> bool:
+    """Return whether the best hypotheses of two matchers put the source's middle (2,) at one place."""
+    a, b = (pose_of(matches.hypotheses[0], middle) for matches in (one, other))
+    near = float(np.hypot(a.east - b.east, a.north - b.north)) <= SAME_M
+    return near and angle_between(a.yaw, b.yaw) <= np.radians(SAME_DEG)
