@@ -12,9 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import RegistrationError
-from mtpcr_geo.core.types import Matches, Pair
+from mtpcr_geo.core.statistics import neg_log10_p
+from mtpcr_geo.core.types import Bev, Matches, Pair
 from mtpcr_geo.match.base import Advance
 from mtpcr_geo.match.correlation import exchanged
 from mtpcr_geo.match.learned.proposals import COARSEST_CELL_M, LONGEST_PX
@@ -63,8 +65,8 @@ def matched_by_network(
     Returns:
         The pair with rasters of cells that the network knows and matches of it, or None where its best pose
         does not stand out from the next and from the mirrored source's, there is nothing to match, or the
-        search by heights, whose margins are enough, had found the same; and how many times stronger that
-        pose is, None if there is none.
+        search by heights, whose margins are enough, had found the same and the network has hardly more tie
+        points that agree than by chance; and how many times stronger that pose is, None if there is none.
 
     """
     source, target, first = pair.source.bev, pair.target.bev, pair.matches
@@ -93,9 +95,12 @@ def matched_by_network(
             source_keypoints=found.target_keypoints,
             target_keypoints=found.source_keypoints,
         )
-    elsewhere = not _same(first, found, centre_of(source.grid))
-    if found.margin is None or found.margin < Limits().margin or not (is_doubted(first) or elsewhere):
+    if found.margin is None or found.margin < Limits().margin:
         return None, found.margin
+    if not is_doubted(first) and _same(first, found, centre_of(source.grid)):
+        # both found one place: which of them has the tie points to show it?
+        if _significance(found, *(view.bev for view in views)) < Limits().neg_log10_p:
+            return None, found.margin
     return (
         pair.with_(source=sides[0], target=sides[1], matches=replace(found, matcher=matcher)),
         found.margin,
@@ -107,3 +112,14 @@ def _same(one: Matches, other: Matches, middle: Floats) -> bool:
     a, b = (pose_of(matches.hypotheses[0], middle) for matches in (one, other))
     near = float(np.hypot(a.east - b.east, a.north - b.north)) <= SAME_M
     return near and angle_between(a.yaw, b.yaw) <= np.radians(SAME_DEG)
+
+
+def _significance(matches: Matches, source: Bev, target: Bev) -> float:
+    """Return minus log10 of the probability that so many matches agree with the best pose by chance."""
+    if matches.by_chance is None:
+        return 0.0
+    chance, tolerance = matches.by_chance
+    best = matches.hypotheses[0]
+    moved = source.grid.to_metres(matches.source_px) @ transforms.yaw_matrix(best.yaw)[:2, :2].T + best.shift
+    gap = np.hypot(*(moved - target.grid.to_metres(matches.target_px)).T)
+    return neg_log10_p(int((gap < tolerance).sum()), len(gap), chance)
