@@ -51,6 +51,11 @@ class Remembering:
         self._known: OrderedDict[tuple[bytes, tuple[int, ...], int], Features] = OrderedDict()
         self._lock = Lock()
 
+    def forget(self) -> None:
+        """Let go of what is remembered."""
+        with self._lock:
+            self._known.clear()
+
     def extract(self, image: Grey, empty: int = 0) -> Features:
         """Find keypoints in a (h, w) uint8 image, or return those that were found before."""
         key = hashlib.blake2b(image.tobytes()).digest(), image.shape, empty

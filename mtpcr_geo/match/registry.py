@@ -160,6 +160,13 @@ class Network:
             self._images = replace(made, extractor=Remembering(made.extractor))
         return self._images
 
+    def forget(self) -> None:
+        """Let go of the descriptions of images, some 100 MB where these are large."""
+        from mtpcr_geo.match.descriptors import Remembering
+
+        if self._images is not None:
+            cast(Remembering, self._images.extractor).forget()
+
     def proposals(self) -> LearnedProposals:
         """Return what proposes poses to the correlation search."""
         from mtpcr_geo.match.learned.proposals import LearnedProposals

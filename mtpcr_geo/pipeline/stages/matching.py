@@ -175,6 +175,13 @@ class Match(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Match the source's raster to the target's; under several verticals where none is known."""
+        try:
+            return self._run(inputs, context)
+        finally:
+            if self._network is not None:
+                self._network.forget()
+
+    def _run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         from mtpcr_geo.pipeline.stages.hypotheses import best_vertical
         from mtpcr_geo.pipeline.stages.rasters import with_rasters
 

@@ -13,23 +13,17 @@ from dataclasses import replace
 import numpy as np
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.statistics import neg_log10_p
 from mtpcr_geo.core.types import Bev, Matches, Pair
 from mtpcr_geo.match.base import Advance
 from mtpcr_geo.match.correlation import exchanged
 from mtpcr_geo.match.learned.proposals import COARSEST_CELL_M, LONGEST_PX
-from mtpcr_geo.match.pose import centre_of, pose_of
 from mtpcr_geo.match.registry import Network
-from mtpcr_geo.match.search import angle_between
 from mtpcr_geo.method.bev import coarsen
 from mtpcr_geo.method.scales import FINEST_OF_LEARNED_M
 from mtpcr_geo.pipeline.stages.views import shown, view_of
 from mtpcr_geo.verdict.limits import Limits
-
-SAME_M, SAME_DEG = 5.0, 5.0
-"""Plan distance of the source's middle, and yaw, within which both matchers found the same pose."""
 
 
 def is_doubted(matches: Matches) -> bool:
@@ -64,9 +58,9 @@ def matched_by_network(
 
     Returns:
         The pair with rasters of cells that the network knows and matches of it, or None where its best pose
-        does not stand out from the next and from the mirrored source's, there is nothing to match, or the
-        search by heights, whose margins are enough, had found the same and the network has hardly more tie
-        points that agree than by chance; and how many times stronger that pose is, None if there is none.
+        does not stand out from the next and from the mirrored source's, there is nothing to match, or hardly
+        more of its matches agree than by chance where the margins of the search by heights are enough; and
+        how many times stronger that pose is, None if there is none.
 
     """
     source, target, first = pair.source.bev, pair.target.bev, pair.matches
@@ -95,23 +89,16 @@ def matched_by_network(
             source_keypoints=found.target_keypoints,
             target_keypoints=found.source_keypoints,
         )
-    if found.margin is None or found.margin < Limits().margin:
+    limits = Limits()
+    if found.margin is None or found.margin < limits.margin:
         return None, found.margin
-    if not is_doubted(first) and _same(first, found, centre_of(source.grid)):
-        # both found one place: which of them has the tie points to show it?
-        if _significance(found, *(view.bev for view in views)) < Limits().neg_log10_p:
-            return None, found.margin
+    significance = _significance(found, *(view.bev for view in views))
+    if not is_doubted(first) and significance < limits.neg_log10_p:
+        return None, found.margin
     return (
         pair.with_(source=sides[0], target=sides[1], matches=replace(found, matcher=matcher)),
         found.margin,
     )
-
-
-def _same(one: Matches, other: Matches, middle: Floats) -> bool:
-    """Return whether the best hypotheses of two matchers put the source's middle (2,) at one place."""
-    a, b = (pose_of(matches.hypotheses[0], middle) for matches in (one, other))
-    near = float(np.hypot(a.east - b.east, a.north - b.north)) <= SAME_M
-    return near and angle_between(a.yaw, b.yaw) <= np.radians(SAME_DEG)
 
 
 def _significance(matches: Matches, source: Bev, target: Bev) -> float:
