@@ -243,6 +243,10 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.match self_likeness``: correlation of the scene under the best hypothesis with itself, moved: a
   scene that repeats itself has 0.4 and more
 - ``mtpcr.match by_proposals``: whether the best hypothesis was proposed by the network
+- ``mtpcr.match second_opinion.margin``: where the network was asked to match by itself: strength of its best
+  pose over the next distinct one and the mirrored source's; null where it found none
+- ``mtpcr.match second_opinion.taken``: whether its matches took the place of those by heights; then the other
+  figures are those of the network
 - ``mtpcr.match null_ratio``: strength of the best hypothesis over the best of these, the ground weighed
 - ``mtpcr.match verticals[].source``: what the source was levelled by, where several verticals were tried
 - ``mtpcr.match verticals[].target``: the same of the target

@@ -106,7 +106,8 @@ AskProposals = Annotated[
     bool,
     Field(
         description="let the network of the matcher bev propose further poses where neither heights nor "
-        "terrain settle the search of the matcher correlation; they are judged like all others"
+        "terrain settle the search of the matcher correlation, judged like all others; and match by itself "
+        "where what was found cannot be accepted"
     ),
     Shown(MATCHING),
 ]

@@ -35,6 +35,9 @@ RARE = {
     # where a vertical that levelling found was corrected
     "mtpcr.refine levelled_again",
     "mtpcr.refine tilt_deg",
+    # where the network was asked to match by itself
+    "mtpcr.match second_opinion.margin",
+    "mtpcr.match second_opinion.taken",
     # where tie points led elsewhere than the search
     "mtpcr.refine from_search",
     # where surfaces and tie points contradicted each other

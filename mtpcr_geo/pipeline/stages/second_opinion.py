@@ -25,6 +25,9 @@ from mtpcr_geo.method.scales import FINEST_OF_LEARNED_M
 from mtpcr_geo.pipeline.stages.views import shown, view_of
 from mtpcr_geo.verdict.limits import Limits
 
+FEW_AGREE = 0.25
+"""Share of the patches that agree, less two, below which they are few."""
+
 
 def is_doubted(matches: Matches) -> bool:
     """Return whether matches of the search by heights cannot be accepted, whatever is made of them.
@@ -40,9 +43,14 @@ def is_doubted(matches: Matches) -> bool:
 
 
 def is_weak(matches: Matches) -> bool:
-    """Return whether hardly more patches agree with the best pose of the search than by chance."""
+    """Return whether few patches agree with the best pose of the search, hardly more than by chance.
+
+    A small site has few patches, and most of them agree: that is not significant, and no reason to doubt.
+    """
     significance = matches.report.get("neg_log10_p")
-    return not matches.repeats and significance is not None and significance < Limits().neg_log10_p
+    if matches.repeats or significance is None or matches.support is None:
+        return False
+    return significance < Limits().neg_log10_p and matches.support < FEW_AGREE
 
 
 def matched_by_network(
