@@ -125,6 +125,7 @@ def test_significant_matches_replace_those_of_a_search_whose_margins_are_enough(
     assert found is not None
 
 
+@pytest.mark.slow
 def test_another_place_is_refused_with_the_network_as_without() -> None:
     rng = np.random.default_rng(8)
     source, target = town(rng, 40_000, 60.0), town(np.random.default_rng(9), 60_000, 60.0)
