@@ -182,6 +182,10 @@ def transform_rows(pair: Pair) -> list[Row]:
     offset = chain.vertical_offset_m
     if offset is not None:
         rows.append(("height offset found", f"{offset:+.3f} m, added to the source's heights"))
+    if pair.matches is not None and "second_opinion" in pair.matches.report:
+        rows.append(
+            ("matched by", "the network, since what the search by heights found could not be accepted")
+        )
     if pair.tie_points is not None and len(pair.tie_points.target):
         rows += _tie_point_rows(pair)
     if pair.refinement is not None:

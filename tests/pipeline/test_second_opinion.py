@@ -14,6 +14,7 @@ from mtpcr_geo.benchmark.metrics import rotation_error_deg
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Grey
 from mtpcr_geo.core.types import Matches, Pair
+from mtpcr_geo.export.descriptions import transform_rows
 from mtpcr_geo.match.base import Features
 from mtpcr_geo.match.descriptors import REMEMBERED, Remembering
 from mtpcr_geo.match.registry import Network
@@ -113,6 +114,7 @@ def test_the_network_finds_the_pose_on_cells_that_it_knows_and_exchanged_the_inv
     assert other == margin, "nor does it hang on the number of threads"
     assert back.matches is not None
     assert there.matches is not None
+    assert any(name == "matched by" for name, _ in transform_rows(there.with_(tie_points=None)))
     assert np.array_equal(back.matches.source_px, there.matches.target_px)
     np.testing.assert_array_equal(back.matches.source_keypoints, there.matches.target_keypoints)
     np.testing.assert_allclose(pose_of(back) @ pose_of(there), np.eye(4), atol=1e-9)

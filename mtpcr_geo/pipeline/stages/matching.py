@@ -228,8 +228,9 @@ class Match(Stage):
             kept = {name: self.metadata[name] for name in ("verticals",) if name in self.metadata}
             self.metadata.clear()
             self.metadata |= {"matches": len(found.matches), **found.matches.report, **kept}
-        self.metadata["second_opinion"] = {"margin": margin, "taken": found is not None}
-        return pair if found is None else found
+            return found
+        self.metadata["second_opinion"] = {"margin": margin, "taken": False}
+        return pair
 
     def _asked(self, threads: int) -> Network:
         """Return the network, one for all questions of this stage."""

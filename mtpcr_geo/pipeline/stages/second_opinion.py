@@ -103,10 +103,9 @@ def matched_by_network(
     significance = _significance(found, *(view.bev for view in views))
     if not is_doubted(first) and significance < limits.neg_log10_p:
         return None, found.margin
-    return (
-        pair.with_(source=sides[0], target=sides[1], matches=replace(found, matcher=matcher)),
-        found.margin,
-    )
+    report = {**found.report, "second_opinion": {"margin": found.margin, "taken": True}}
+    matches = replace(found, matcher=matcher, report=report)
+    return pair.with_(source=sides[0], target=sides[1], matches=matches), found.margin
 
 
 def _significance(matches: Matches, source: Bev, target: Bev) -> float:
