@@ -47,7 +47,7 @@ class Remembering:
     """
 
     def __init__(self, extractor: Extractor) -> None:
-        self._extractor = extractor
+        self.extractor = extractor
         self._known: OrderedDict[tuple[bytes, tuple[int, ...], int], Features] = OrderedDict()
         self._lock = Lock()
 
@@ -64,7 +64,7 @@ class Remembering:
             if found is not None:
                 self._known[key] = found
                 return found
-        found = self._extractor.extract(image, empty)
+        found = self.extractor.extract(image, empty)
         with self._lock:
             self._known[key] = found
             while len(self._known) > REMEMBERED:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
 from mtpcr_geo.core.errors import OptionError
-from mtpcr_geo.core.system import usable_cores
+from mtpcr_geo.core.system import opencv_in_one_thread, usable_cores
 from mtpcr_geo.core.types import Matches
 from mtpcr_geo.match.base import Advance, Matcher, View
 from mtpcr_geo.match.correlation import CorrelationSettings
@@ -133,6 +133,45 @@ def _by_keypoints(name: str, keypoints: KeypointSettings) -> KeypointMatcher:
     )
 
 
+@dataclass(frozen=True)
+class SmallerTurned:
+    """A keypoint matcher that turns the raster of fewer filled cells, whichever is the source.
+
+    Source and target exchanged give the inverse.
+
+    Attributes:
+        matcher: of the smaller raster to the larger one.
+
+    """
+
+    matcher: KeypointMatcher
+    needs_image: bool = field(default=True, init=False)
+    needs_one_cell: bool = field(default=True, init=False)
+
+    def match(
+        self,
+        source: View,
+        target: View,
+        *,
+        seed: int = 0,
+        yaw: float | None = None,
+        advance: Advance = lambda n: None,
+    ) -> Matches:
+        """Match two views, see `Matcher.match`."""
+        from mtpcr_geo.match.correlation import exchanged
+
+        with opencv_in_one_thread():
+            if (source.bev.count > 0).sum() <= (target.bev.count > 0).sum():
+                return self.matcher.match(source, target, seed=seed, yaw=yaw, advance=advance)
+            yaw = None if yaw is None else -yaw
+            found = self.matcher.match(target, source, seed=seed, yaw=yaw, advance=advance)
+        return replace(
+            exchanged(found),
+            source_keypoints=found.target_keypoints,
+            target_keypoints=found.source_keypoints,
+        )
+
+
 @dataclass
 class Network:
     """The network in the package: it proposes poses and matches, and describes each image once for both.
@@ -173,19 +212,30 @@ class Network:
 
         return LearnedProposals(lambda: self.images().extractor, self.threads or usable_cores())
 
-    def matcher(self) -> KeypointMatcher:
-        """Return the matcher of whole rasters."""
+    def matcher(self, *, remembering: bool = True) -> SmallerTurned:
+        """Return the matcher of whole rasters.
+
+        Args:
+            remembering: whether what was described before is not described again, which holds memory.
+
+        """
+        from mtpcr_geo.match.descriptors import Remembering
         from mtpcr_geo.match.keypoints import KeypointMatcher
 
         model = descriptions(None)[self.name]
         assert model.extractor is not None
-        return KeypointMatcher(
-            self.name,
-            self.images(),
-            turns=model.turns,
-            magnify_to=model.extractor.magnify_to,
-            candidates=model.extractor.candidates,
-            workers=self.threads or usable_cores(),
+        images = self.images()
+        if not remembering:
+            images = replace(images, extractor=cast(Remembering, images.extractor).extractor)
+        return SmallerTurned(
+            KeypointMatcher(
+                self.name,
+                images,
+                turns=model.turns,
+                magnify_to=model.extractor.magnify_to,
+                candidates=model.extractor.candidates,
+                workers=self.threads or usable_cores(),
+            )
         )
 
 

@@ -35,7 +35,7 @@ _METRIC_SHARE = 1e-3
 _WRITERS = ("writers.", "mtpcr.write")
 _STATED = {
     "name": "verdict", "sentence": "sentence", "probability": "probability", "reasons": "reasons",
-    "rivals": "rivals", "forced": "forced",
+    "rivals": "rivals",
 }  # fmt: skip
 """What a transform.json says of the verdict, and where run.json says it."""
 
@@ -217,7 +217,9 @@ def _files(record: Mapping[str, Any], place: Path) -> Iterator[Difference]:
         if T is None or not np.array_equal(kept, np.array(T, np.float64)):
             yield Difference("file", transform.name, "the transform of run.json", "another transform")
         stated = verdict_of(transform)
-        if stated is not None and any(stated.get(name) != record.get(key) for name, key in _STATED.items()):
+        if stated is not None and any(
+            name in stated and stated[name] != record.get(key) for name, key in _STATED.items()
+        ):
             yield Difference("file", transform.name, "the verdict of run.json", "another verdict")
     recording = place / OUTPUT_NAMES["recording"]
     if recording.is_file():

@@ -64,7 +64,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
     evidence = Evidence(
         held_out=len(held_out),
         held_out_agreeing=int(agreeing.sum()),
-        chance=_chance(matches, tolerance),
+        chance=chance_of(matches, tolerance),
         tolerance_m=tolerance,
         held_out_median_m=float(np.median(held_out[agreeing])) if agreeing.any() else None,
         margin=matches.margin if matches is not None else None,
@@ -111,8 +111,14 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
     return evidence, more
 
 
-def _chance(matches: Matches | None, tolerance: float) -> float | None:
-    """Return how probably a held-out tie point agrees by chance; None where that is not known."""
+def chance_of(matches: Matches | None, tolerance: float) -> float | None:
+    """Return how probably a match agrees with a pose by chance; None where that is not known.
+
+    Args:
+        matches: as their matcher found them.
+        tolerance: plan distance within which one agrees, metres.
+
+    """
     if matches is None:
         return None
     if matches.search_radius_m is not None:

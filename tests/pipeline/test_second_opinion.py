@@ -7,18 +7,18 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from helpers_scene import town
+from helpers_scene import rasterise, town
 
 from mtpcr_geo import register
 from mtpcr_geo.benchmark.metrics import rotation_error_deg
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Grey
-from mtpcr_geo.core.types import Matches, Pair
+from mtpcr_geo.core.types import Hypothesis, Matches, Pair
 from mtpcr_geo.export.descriptions import transform_rows
 from mtpcr_geo.match.base import Features
 from mtpcr_geo.match.descriptors import REMEMBERED, Remembering
 from mtpcr_geo.match.registry import Network
-from mtpcr_geo.pipeline.stages.second_opinion import is_doubted, is_weak, matched_by_network
+from mtpcr_geo.pipeline.stages.second_opinion import _significance, is_doubted, is_weak, matched_by_network
 
 NONE = np.empty((0, 2))
 
@@ -125,6 +125,15 @@ def test_significant_matches_replace_those_of_a_search_whose_margins_are_enough(
     strong = pair.with_(matches=replace(pair.matches, margin=3.0, null_ratio=3.0))
     found, _ = matched_by_network(strong, 0, Network(1), lambda n: None)
     assert found is not None
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_chance_that_was_measured_on_few_matches_is_not_believed(share: float) -> None:
+    bev = rasterise(np.array([[0.0, 0.0, 0.0], [10.0, 10.0, 0.0]]))
+    px = np.array([[1.0, 1.0], [4.0, 2.0], [7.0, 7.0]])
+    best = Hypothesis(0.0, (0.0, 0.0), 1.0)
+    found = Matches(px, px + [[0, 0], [5, 5], [5, 5]], np.ones(3), (best,), by_chance=(share, 1.0))
+    assert _significance(found, bev, bev) < 6.0
 
 
 @pytest.mark.slow

@@ -104,6 +104,8 @@ def fed_back(
         strength, before = found.strength or 0.0, matches.strength or 0.0
         if strength < WEAKEST * before:
             return None
+        if matches.strength is None and (found.margin or 0.0) < min(SURE, matches.margin or 0.0):
+            return None  # of matchers whose strengths are not compared the best pose must stand out as well
         refinement = refined_pair(again, settings)
     except RegistrationError:
         return None  # a second search never costs the first
@@ -335,7 +337,9 @@ def _solved(again: Pair, before: Pair) -> Pair:
     if matcher.needs_image:
         again = again.with_(source=shown(again.source), target=shown(again.target))
     views = [view_of(side, matcher.needs_image) for side in (again.source, again.target)]
-    matches = replace(matcher.match(*views, seed=solution.settings.seed), matcher=matcher)
+    found = matcher.match(*views, seed=solution.settings.seed)
+    kept = {name: first.report[name] for name in ("second_opinion",) if name in first.report}
+    matches = replace(found, matcher=matcher, report={**found.report, **kept})
     assert again.source.bev is not None
     assert again.target.bev is not None
     tie_points = tie_points_of(matches, again.source.bev, again.target.bev, seed=solution.settings.seed)

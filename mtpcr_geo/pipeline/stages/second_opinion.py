@@ -13,16 +13,19 @@ from dataclasses import replace
 import numpy as np
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.errors import RegistrationError
+from mtpcr_geo.core.errors import InputError, RegistrationError
 from mtpcr_geo.core.statistics import neg_log10_p
 from mtpcr_geo.core.types import Bev, Matches, Pair
 from mtpcr_geo.match.base import Advance
-from mtpcr_geo.match.correlation import exchanged
 from mtpcr_geo.match.learned.proposals import COARSEST_CELL_M, LONGEST_PX
+from mtpcr_geo.match.pose import centre_of, pose_of
+from mtpcr_geo.match.pyramid import Pyramid
 from mtpcr_geo.match.registry import Network
+from mtpcr_geo.match.repetition import REPEATS, self_likeness
 from mtpcr_geo.method.bev import coarsen
 from mtpcr_geo.method.scales import FINEST_OF_LEARNED_M
 from mtpcr_geo.pipeline.stages.views import shown, view_of
+from mtpcr_geo.verdict.evidence import chance_of
 from mtpcr_geo.verdict.limits import Limits
 
 FEW_AGREE = 0.25
@@ -66,9 +69,9 @@ def matched_by_network(
 
     Returns:
         The pair with rasters of cells that the network knows and matches of it, or None where its best pose
-        does not stand out from the next and from the mirrored source's, there is nothing to match, or hardly
-        more of its matches agree than by chance where the margins of the search by heights are enough; and
-        how many times stronger that pose is, None if there is none.
+        does not stand out from the next and from the mirrored source's, the scene repeats itself under it,
+        there is nothing to match, or hardly more of its matches agree than by chance where the margins of the
+        search by heights are enough; and how many times stronger that pose is, None if there is none.
 
     """
     source, target, first = pair.source.bev, pair.target.bev, pair.matches
@@ -83,28 +86,21 @@ def matched_by_network(
         shown(replace(side, bev=coarsen(bev, factor), appearance=None))
         for side, bev in ((pair.source, source), (pair.target, target))
     ]
-    matcher = network.matcher()
     views = [view_of(side, True) for side in sides]
-    # of two clouds it is the smaller one that is turned, whichever is the source
-    back = bool((source.count > 0).sum() > (target.count > 0).sum())
     try:
-        found = matcher.match(*(views[::-1] if back else views), seed=seed, advance=advance)
-    except RegistrationError:
+        found = network.matcher().match(*views, seed=seed, advance=advance)
+    except (RegistrationError, InputError):
         return None, None  # a second opinion never costs the first
-    if back:
-        found = replace(
-            exchanged(found),
-            source_keypoints=found.target_keypoints,
-            target_keypoints=found.source_keypoints,
-        )
     limits = Limits()
     if found.margin is None or found.margin < limits.margin:
         return None, found.margin
-    significance = _significance(found, *(view.bev for view in views))
-    if not is_doubted(first) and significance < limits.neg_log10_p:
+    if not is_doubted(first) and _significance(found, views[0].bev, views[1].bev) < limits.neg_log10_p:
+        return None, found.margin
+    layers = Pyramid(views[0].bev, views[1].bev).at(1)
+    if self_likeness(*layers, pose_of(found.hypotheses[0], centre_of(layers[0].grid))) >= REPEATS:
         return None, found.margin
     report = {**found.report, "second_opinion": {"margin": found.margin, "taken": True}}
-    matches = replace(found, matcher=matcher, report=report)
+    matches = replace(found, matcher=network.matcher(remembering=False), report=report)
     return pair.with_(source=sides[0], target=sides[1], matches=matches), found.margin
 
 
@@ -112,8 +108,8 @@ def _significance(matches: Matches, source: Bev, target: Bev) -> float:
     """Return minus log10 of the probability that so many matches agree with the best pose by chance."""
     if matches.by_chance is None:
         return 0.0
-    chance, tolerance = matches.by_chance
+    tolerance = matches.by_chance[1]
     best = matches.hypotheses[0]
     moved = source.grid.to_metres(matches.source_px) @ transforms.yaw_matrix(best.yaw)[:2, :2].T + best.shift
     gap = np.hypot(*(moved - target.grid.to_metres(matches.target_px)).T)
-    return neg_log10_p(int((gap < tolerance).sum()), len(gap), chance)
+    return neg_log10_p(int((gap < tolerance).sum()), len(gap), chance_of(matches, tolerance) or 1.0)
