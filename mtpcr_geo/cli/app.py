@@ -5,10 +5,12 @@ Nothing of a verb is imported before it is called or its help is asked for.
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import inspect
 import os
 import signal
+import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -285,7 +287,36 @@ def main() -> None:
     # pydantic would read the metadata of every package installed, to look for plugins
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     signal.signal(signal.SIGTERM, _interrupt)
-    app(prog_name=NAME)
+    with _ending_at_once():
+        app(prog_name=NAME)
+
+
+@contextmanager
+def _ending_at_once() -> Iterator[None]:
+    """Leave it to the system to give back this process's memory at its end.
+
+    Python would take down every module and array first, a fifth of a second after the last file is written.
+    What threads still do and all that is registered to be done at exit is done before.
+    """
+    status: list[int] = []
+
+    def end() -> None:
+        if status:
+            try:
+                sys.stdout.flush()
+                sys.stderr.flush()
+            except (OSError, ValueError):
+                return  # Python tells of it
+            os._exit(status[0])
+
+    # called last: what is registered later is called earlier
+    atexit.register(end)
+    try:
+        yield
+    except SystemExit as error:
+        if error.code is None or isinstance(error.code, int):
+            status.append(error.code or 0)
+        raise
 
 
 def _interrupt(signum: int, frame: object) -> None:

@@ -26,6 +26,10 @@ def run(options: RegisterVerb) -> None:
         mtpcr-geo register ground.laz aerial.laz -o out --dump-pipeline > mine.json
 
     """
+    from mtpcr_geo.export.recording.process import start_ahead
+
+    if options.recording and options.threads != 1 and not options.dump_pipeline:
+        start_ahead()
     from mtpcr_geo.cli.summary import SUMMARY_NEEDS, print_registration
     from mtpcr_geo.pipeline.grammar import dump
     from mtpcr_geo.registration import build_pipeline, read_options, register

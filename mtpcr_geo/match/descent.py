@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mtpcr_geo.core.system import usable_cores
+from mtpcr_geo.match.nearby import score_nearby
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.pyramid import Pyramid
-from mtpcr_geo.match.search import score_nearby
 
 ESTIMATE_CELLS = 20_000.0
 """Cells that tell which yaw and shift fit best on the way down to the finest level."""

@@ -12,11 +12,12 @@ from mtpcr_geo.core.types import Bev, Hypothesis
 from mtpcr_geo.match.candidates import Candidate, Pool, same_pose
 from mtpcr_geo.match.descent import comb, comb_each, follow
 from mtpcr_geo.match.judge import CLEAR_MARGIN, Judge
+from mtpcr_geo.match.nearby import score_nearby
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.pyramid import Level, Pyramid
 from mtpcr_geo.match.repetition import REPEATS, self_likeness
-from mtpcr_geo.match.search import GlobalSearch, Layer, all_yaws, distinct, score_nearby
+from mtpcr_geo.match.search import GlobalSearch, Layer, all_yaws, distinct
 from mtpcr_geo.match.terrain import Terrain, cell_to_compare
 from mtpcr_geo.match.terrain_search import propose
 from mtpcr_geo.method.ground import bare

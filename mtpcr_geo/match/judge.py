@@ -16,10 +16,11 @@ from mtpcr_geo.match.candidates import (
     GroundWeights,
     same_pose,
 )
+from mtpcr_geo.match.nearby import score_nearby
 from mtpcr_geo.match.patches import PatchMatches, match_patches
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
 from mtpcr_geo.match.pyramid import Pyramid
-from mtpcr_geo.match.search import Layer, score_nearby
+from mtpcr_geo.match.search import Layer
 from mtpcr_geo.match.terrain import GroundComparison, Terrain, compare_ground, fewest_of
 from mtpcr_geo.method.scales import Scales
 from mtpcr_geo.method.solve import iterative_svd, ransac_upright

@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 
 from mtpcr_geo.core.arrays import Image
+from mtpcr_geo.match.nearby import target_under
 from mtpcr_geo.match.pose import Pose, warp_to
-from mtpcr_geo.match.search import FILLED, Layer, spectrum, target_under
+from mtpcr_geo.match.search import FILLED, Layer, spectrum
 
 REPEATS = 0.4
 """Correlation of a scene with itself, moved, from which it repeats itself. Nine real sites have 0.19-0.28;

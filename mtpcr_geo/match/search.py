@@ -7,6 +7,7 @@ a measure of how unlikely the agreement is by chance, comparable between small a
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -14,13 +15,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from mtpcr_geo.core.arrays import Floats, Image
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.system import usable_cores
-from mtpcr_geo.match.pose import Pose, centre_of, source_from_target_pixels, warp, warp_to
+from mtpcr_geo.match.pose import Pose, centre_of, warp_to
 from mtpcr_geo.method.images import Channels
 
 HEIGHT_FLOOR_M = 0.1
@@ -29,10 +29,6 @@ STEP_FLOOR = 0.02
 FILLED = 0.5
 """Share of a turned cell that must come from filled cells for it to count as filled."""
 _SAME_YAW = 1e-9
-FEW_CELLS = 4096
-"""Cells of the source up to which the sums of all shifts are taken at once."""
-SPECTRAL_WINDOW = 5
-"""Shifts to either side from which a window is scored in the frequency domain."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +44,7 @@ def correlation_score(
     products: tuple[Image, Image],
     source_squares: tuple[Image, Image],
     target_squares: tuple[Image, Image],
+    scratch: Image | None = None,
 ) -> Image:
     """Score from sums over the overlapping cells: sum of both normalised correlations times sqrt(overlap).
 
@@ -58,21 +55,35 @@ def correlation_score(
         overlap: cells filled in both images.
         products: per channel, the sum of source times target.
         source_squares, target_squares: per channel, the sums of squares.
+        scratch: (4, ...) float32 to work in, of which the first becomes the result; made if not given.
 
     """
-    cells = np.maximum(overlap, np.float32(1.0))
-    total = np.zeros_like(cells)
+    if scratch is None:
+        scratch = np.empty((4, *overlap.shape), np.float32)
+    total, cells, scale, least = scratch
+    np.maximum(overlap, np.float32(1.0), out=cells)
+    total.fill(0.0)
     for product, ss, tt, floor in zip(
         products, source_squares, target_squares, (HEIGHT_FLOOR_M, STEP_FLOOR), strict=True
     ):
-        least = cells * np.float32(floor**2)
-        scale = np.maximum(ss, least)
+        np.multiply(cells, np.float32(floor**2), out=least)
+        np.maximum(ss, least, out=scale)
         scale *= np.maximum(tt, least, out=least)
         np.sqrt(scale, out=scale)
         np.divide(product, scale, out=scale)
-        total += np.clip(scale, -1.0, 1.0, out=scale)
+        total += np.clip(scale, np.float32(-1.0), np.float32(1.0), out=scale)
     total *= np.sqrt(cells, out=cells)
-    return np.asarray(total, np.float32)
+    return np.asarray(total)
+
+
+class _Room(threading.local):
+    """Images that one thread works in: fresh memory for each yaw would take as long as what is done in it."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self.spectra = np.empty((5, *shape), np.float32)
+        self.product = np.empty(shape, np.float32)
+        self.sums = np.empty((7, *shape), np.float32)
+        self.scratch = np.empty((4, *shape), np.float32)
 
 
 class GlobalSearch:
@@ -96,7 +107,8 @@ class GlobalSearch:
         self._turned_side = side
         height, width = target.grid.shape
         self._shape = (cv2.getOptimalDFTSize(height + side - 1), cv2.getOptimalDFTSize(width + side - 1))
-        self._target_spectra = self._spectra(target.channels.stack)
+        self._room = _Room(self._shape)
+        self._target_spectra = [one.copy() for one in self._spectra(target.channels.stack)]
         self._allowed: Callable[[float], NDArray[np.bool_]] | None = None
 
     def restrict(self, place: Callable[[float], tuple[float, float]], radius: float) -> None:
@@ -126,8 +138,16 @@ class GlobalSearch:
         return grid.west + (dx + half) * grid.cell, grid.north - (dy + half) * grid.cell
 
     def _spectra(self, stack: Image) -> list[Image]:
-        """Transform height, steps, mask and the squares of the first two; packed as OpenCV packs them."""
-        return [spectrum(image, self._shape) for image in (*stack, stack[0] ** 2, stack[1] ** 2)]
+        """Transform height, steps, mask and the squares of the first two; packed as OpenCV packs them.
+
+        They are lost with the next call by the same thread, as are the scores below.
+        """
+        images = (*stack, stack[0] ** 2, stack[1] ** 2)
+        room = self._room
+        return [
+            spectrum(image, self._shape, out, room.product)
+            for image, out in zip(images, room.spectra, strict=True)
+        ]
 
     def _turned(self, yaw: float) -> tuple[Image, Grid]:
         """Turn the source about its centre onto a square grid large enough for any yaw."""
@@ -140,7 +160,8 @@ class GlobalSearch:
 
     def scores(self, yaw: float) -> tuple[Image, Image]:
         """Score every shift under one yaw: scores and overlapping cells, both over cyclic shifts."""
-        return self._scores(yaw, self._spectra(self._turned(yaw)[0]))
+        score, overlap = self._scores(yaw, self._spectra(self._turned(yaw)[0]))
+        return score.copy(), overlap.copy()
 
     def _scores(self, yaw: float, spectra: list[Image], opposite: bool = False) -> tuple[Image, Image]:
         """Score every shift under one yaw.
@@ -155,11 +176,12 @@ class GlobalSearch:
         a, e, m, aa, ee = spectra
         A, E, M, AA, EE = self._target_spectra
         pairs = ((M, m), (A, a), (E, e), (M, aa), (M, ee), (AA, m), (EE, m))
-        overlap, pa, pe, sa, se, ta, te = (
-            cv2.idft(cv2.mulSpectrums(t, s, 0, conjB=not opposite), flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)
-            for t, s in pairs
-        )
-        score = correlation_score(overlap, (pa, pe), (sa, se), (ta, te))
+        room = self._room
+        for (t, s), image in zip(pairs, room.sums, strict=True):
+            cv2.mulSpectrums(t, s, 0, room.product, conjB=not opposite)
+            cv2.idft(room.product, image, cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)
+        overlap, pa, pe, sa, se, ta, te = room.sums
+        score = correlation_score(overlap, (pa, pe), (sa, se), (ta, te), room.scratch)
         if opposite:
             back = (1 - self._turned_side, 1 - self._turned_side)
             score, overlap = (np.roll(image, back, axis=(0, 1)) for image in (score, overlap))
@@ -239,12 +261,25 @@ def pairs_of_opposite(yaws: Iterable[float]) -> list[tuple[float, ...]]:
     return paired
 
 
-def spectrum(image: Image, shape: tuple[int, int]) -> Image:
-    """Return the transform of an image padded with zeros to a shape; packed as OpenCV packs it."""
-    padded = np.zeros(shape, np.float32)
+def spectrum(
+    image: Image, shape: tuple[int, int], out: Image | None = None, padded: Image | None = None
+) -> Image:
+    """Return the transform of an image padded with zeros to a shape; packed as OpenCV packs it.
+
+    Args:
+        image: (h, w) float32.
+        shape: of the transform.
+        out: float32 of that shape to put it in; made if not given.
+        padded: float32 of that shape to work in; made if not given.
+
+    """
+    if padded is None:
+        padded = np.zeros(shape, np.float32)
+    else:
+        padded.fill(0.0)
     padded[: image.shape[0], : image.shape[1]] = image
     # not told of the rows of zeros, OpenCV takes a transform that is four times as fast
-    return np.asarray(cv2.dft(padded, dst=padded), np.float32)
+    return np.asarray(cv2.dft(padded, padded if out is None else out), np.float32)
 
 
 def angle_between(a: float, b: float) -> float:
@@ -273,146 +308,6 @@ def distinct(poses: Iterable[Pose], count: int, yaw_apart: float, metres_apart: 
             if len(kept) == count:
                 break
     return kept
-
-
-def score_nearby(
-    source: Layer, target: Layer, pose: Pose, window: int, max_cells: float = np.inf
-) -> tuple[Pose, Image]:
-    """Score a pose and all shifts within ``window`` cells of it; give the best and the score window.
-
-    Only the part of the target under the source is compared, so it costs little at fine cells.
-
-    Args:
-        source, target: layers of one cell size.
-        pose: the pose.
-        window: shifts up to so many cells are tried.
-        max_cells: of larger parts only every n-th row is compared, for an estimate.
-
-    """
-    part, offset = target_under(source.grid, target.grid, pose, window)
-    side = 2 * window + 1
-    nothing = np.full((side, side), -np.inf, np.float32)
-    if part.width <= 2 * window or part.height <= 2 * window:
-        return Pose(pose.yaw, pose.east, pose.north, -np.inf, 0), nothing
-    by_spectra = window >= SPECTRAL_WINDOW
-    cells = (part.height - side + 1) * (part.width - side + 1)
-    step = 1 if by_spectra else max(1, int(cells / max_cells))
-    warped = _warp_rows(source, part, pose, window, step)
-    mask = (warped[2] > FILLED).astype(np.float32)
-    row0, column0 = offset
-    stack = target.channels.stack[:, row0 : row0 + part.height, column0 : column0 + part.width]
-    a, e = warped[0] * mask, warped[1] * mask
-    if by_spectra:
-        sums = _sums_by_spectra(a, e, mask, stack, window)
-    elif mask.size <= FEW_CELLS:
-        sums = _sums_of_few(a, e, mask, stack, window, step)
-    else:
-        sums = _sums_by_shifts(a, e, mask, stack, window, step)
-    overlap = sums[0]
-    score = correlation_score(overlap, (sums[1], sums[2]), (sums[3], sums[4]), (sums[5], sums[6]))
-    best_dy, best_dx = divmod(int(np.argmax(score)), side)
-    cell = target.grid.cell
-    best = Pose(
-        pose.yaw,
-        pose.east + (best_dx - window) * cell,
-        pose.north - (best_dy - window) * cell,
-        float(score[best_dy, best_dx]),
-        round(float(overlap[best_dy, best_dx])),
-    )
-    return best, score
-
-
-def _sums_of_few(a: Image, e: Image, m: Image, stack: Image, window: int, step: int) -> Image:
-    """Return the same as `_sums_by_shifts`, by a copy of the target's images for each shift.
-
-    Of small images this takes a quarter of the time, of large ones more.
-    """
-    side = 2 * window + 1
-    shape = (stack.shape[1] - side + 1, m.shape[1])
-    shifted = sliding_window_view(stack, shape, axis=(1, 2))[:, :, :, ::step]
-    A, E, M = np.ascontiguousarray(shifted).reshape(3, side**2, m.size)
-    m, a, e = m.ravel(), a.ravel(), e.ravel()
-    sums = np.empty((7, side**2), np.float32)
-    sums[[0, 3, 4]] = np.stack([m, a * a, e * e]) @ M.T
-    sums[1], sums[2] = A @ a, E @ e
-    sums[5], sums[6] = (A * A) @ m, (E * E) @ m
-    return np.asarray(sums.reshape(7, side, side) * np.float32(step))
-
-
-def _sums_by_shifts(a: Image, e: Image, m: Image, stack: Image, window: int, step: int) -> Image:
-    """Return the (7, n, n) sums that a score is made of, for each shift.
-
-    The source's images hold every ``step``-th row of those under the target's. They are filled up with
-    zeros to the length of the target's: a shift is then a place in the target's cells laid end to end, and
-    none is copied for it.
-    """
-    columns = m.shape[1]
-    side, width = 2 * window + 1, stack.shape[2]
-    rows = stack.shape[1] - side + 1
-    length = (len(m) - 1) * width + columns
-    source = np.zeros((5, len(m), width), np.float32)
-    for row, image in zip(source, (m, a, e, a * a, e * e), strict=True):
-        row[:, :columns] = image
-    m, a, e, aa, ee = source.reshape(5, -1)[:, :length]
-    sums = np.empty((7, side, side), np.float32)
-    for dy in range(side):
-        A, E, M = np.ascontiguousarray(stack[:, dy : dy + rows : step]).reshape(3, -1)
-        AA, EE = A * A, E * E
-        for dx in range(side):
-            at = slice(dx, dx + length)
-            sums[:, dy, dx] = (
-                m @ M[at],
-                a @ A[at],
-                e @ E[at],
-                aa @ M[at],
-                ee @ M[at],
-                m @ AA[at],
-                m @ EE[at],
-            )
-    return np.asarray(sums * np.float32(step))
-
-
-def _warp_rows(source: Layer, part: Grid, pose: Pose, margin: int, step: int) -> Image:
-    """Bring the source's channels onto every ``step``-th row of a part of a grid, without its rim."""
-    M = source_from_target_pixels(source.grid, part, pose)
-    M = np.column_stack([M[:, 0], step * M[:, 1], M[:, 2] + margin * (M[:, 0] + M[:, 1])])
-    size = (part.width - 2 * margin, -(-(part.height - 2 * margin) // step))
-    return warp(source.channels.stack, M, size)
-
-
-def _sums_by_spectra(a: Image, e: Image, m: Image, stack: Image, window: int) -> Image:
-    """Return the same sums from all rows, by the correlation theorem: cheaper where there are many shifts."""
-    side = 2 * window + 1
-    shape = (cv2.getOptimalDFTSize(stack.shape[1]), cv2.getOptimalDFTSize(stack.shape[2]))
-
-    A, E, M = stack
-    pairs = ((m, M), (a, A), (e, E), (a * a, M), (e * e, M), (m, A * A), (m, E * E))
-    known: dict[int, Image] = {}
-    sums = np.empty((7, side, side), np.float32)
-    for number, (one, other) in enumerate(pairs):
-        for image in (one, other):
-            if id(image) not in known:
-                known[id(image)] = spectrum(image, shape)
-        product = cv2.mulSpectrums(known[id(other)], known[id(one)], 0, conjB=True)
-        sums[number] = cv2.idft(product, flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)[:side, :side]
-    # rounding leaves a trace where nothing overlaps
-    sums[0] = np.round(sums[0])
-    return sums
-
-
-def target_under(source: Grid, target: Grid, pose: Pose, margin: int) -> tuple[Grid, tuple[int, int]]:
-    """Cut from the target's grid what the posed source can reach, plus a margin of cells."""
-    half_w, half_h = source.width * source.cell / 2, source.height * source.cell / 2
-    corners = np.array([[-half_w, -half_h], [half_w, -half_h], [half_w, half_h], [-half_w, half_h]])
-    c, s = np.cos(pose.yaw), np.sin(pose.yaw)
-    placed = corners @ np.array([[c, s], [-s, c]]) + [pose.east, pose.north]
-    px = target.to_pixel(placed)
-    column0 = int(np.clip(np.floor(px[:, 0].min()) - margin, 0, target.width))
-    row0 = int(np.clip(np.floor(px[:, 1].min()) - margin, 0, target.height))
-    column1 = int(np.clip(np.ceil(px[:, 0].max()) + margin + 1, column0, target.width))
-    row1 = int(np.clip(np.ceil(px[:, 1].max()) + margin + 1, row0, target.height))
-    part = target.part(slice(row0, row1), slice(column0, column1))
-    return part, (row0, column0)
 
 
 def pivot_of(layer: Layer) -> NDArray[np.float64]:

@@ -8,12 +8,14 @@ y up.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.transforms import angle_deg, centroid, rotation_to_up
 from mtpcr_geo.method.downsample import one_per_voxel
 
@@ -88,7 +90,8 @@ def floor_along(xyz: Floats, about: Floats, extent: float) -> Floor:
     found = Floor(about, 0, 0.0, float("inf"), extent, 0.5)
     for _ in range(ROUNDS):
         R = rotation_to_up(up)
-        lowest = _lowest(xyz @ R.T, cell)
+        turned = xyz @ R.T
+        lowest = _lowest(turned, cell)
         if len(lowest) < FEWEST_CELLS:
             return found
         slope, level, rest = _plane(lowest, extent)
@@ -97,7 +100,7 @@ def floor_along(xyz: Floats, about: Floats, extent: float) -> Floor:
         normal = np.array([-slope[0], -slope[1], 1.0])
         new = R.T @ (normal / np.linalg.norm(normal))
         well_off = max(4.0 * spread, LEAST_UNEVEN * extent)
-        height = (xyz @ R.T) @ normal - level
+        height = turned @ normal - level
         above, below = (height > well_off).sum(), (height < -well_off).sum()
         share = float((above + 1) / (above + below + 2))
         found = Floor(new, int(on.sum()), float(on.mean()), spread, extent, share)
@@ -109,10 +112,13 @@ def floor_along(xyz: Floats, about: Floats, extent: float) -> Floor:
 
 def _lowest(xyz: Floats, cell: float) -> Floats:
     """Return the lowest point of each cell, (m, 3), the outermost hundredth of the points left out."""
-    low, high = np.percentile(xyz[:, :2], [0.5, 99.5], axis=0)
-    inside = ((xyz[:, :2] >= low) & (xyz[:, :2] <= high)).all(axis=1)
+    columns = np.ascontiguousarray(xyz.T[:2])
+    limits = [np.percentile(column, [0.5, 99.5]) for column in columns]
+    inside = np.ones(len(xyz), bool)
+    for column, (low, high) in zip(columns, limits, strict=True):
+        inside &= (column >= low) & (column <= high)
     xyz = xyz[inside]
-    key = _cell_numbers(np.floor((xyz[:, :2] - low) / cell))
+    key = _cell_numbers(np.floor((xyz[:, :2] - [low for low, _ in limits]) / cell))
     z = np.ascontiguousarray(xyz[:, 2])
     # hardly any points may all be left out
     lowest = np.full(int(key.max(initial=-1)) + 1, np.inf)
@@ -162,7 +168,9 @@ def floors_of(xyz: Floats, extent: float, rng: np.random.Generator) -> tuple[Flo
     """
     few = one_per_voxel(xyz, extent / VOXELS_ACROSS, rng, POINTS)
     axes = np.concatenate([np.eye(3), -np.eye(3)])[[2, 5, 0, 1, 3, 4]]
-    found = sorted((floor_along(few, axis, extent) for axis in axes), key=lambda floor: -floor.quality)
+    with ThreadPoolExecutor(usable_cores()) as threads:
+        floors = threads.map(lambda axis: floor_along(few, axis, extent), axes)
+        found = sorted(floors, key=lambda floor: -floor.quality)
     distinct: list[Floor] = []
     for floor in found:
         if all(angle_deg(floor.up, other.up) > APART_DEG for other in distinct):

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mtpcr_geo.core.arrays import Floats
+
+_PLACES_AT_ONCE = 4096
 
 
 def local_shapes(
@@ -27,8 +31,20 @@ def local_shapes(
 
     """
     index = np.asarray(tree.batch_knn_search(places, neighbours, threads)[0]).astype(np.int64)
+    parts = [index[start : start + _PLACES_AT_ONCE] for start in range(0, len(index), _PLACES_AT_ONCE)]
+    if len(parts) < 2 or threads < 2:
+        shapes = [_shapes(points, part) for part in parts or [index]]
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            shapes = list(pool.map(lambda part: _shapes(points, part), parts))
+    spreads, axes = (np.concatenate(each) for each in zip(*shapes, strict=True))
+    return spreads, axes
+
+
+def _shapes(points: Floats, index: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Find spreads and axes of groups of points, (m, k) indices."""
     neighbourhood = points[index]
-    neighbourhood = neighbourhood - neighbourhood.mean(axis=1, keepdims=True)
+    neighbourhood -= neighbourhood.mean(axis=1, keepdims=True)
     values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", neighbourhood, neighbourhood))
     return np.sqrt(np.maximum(values, 0.0)), axes
 

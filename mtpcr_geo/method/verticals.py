@@ -33,6 +33,7 @@ PLUMB_SIGMA_DEG = 1.5
 WORST_SPREAD_DEG = 2.3
 """Robust spread about the vertical above which what leans that much is no evidence of it: crowns and branches
 of sparse trees spread evenly over the 4.5 degrees that count as agreeing, walls and trunks by 0.8 to 2."""
+_PLANES_AT_ONCE = 16
 WORST_CONDITION = 0.04
 """Share of the vertical evidence that must speak for the less well seen of the two tilt directions."""
 
@@ -64,11 +65,9 @@ def ground_plane(
     if not usable.any():
         return about, 0.0
     normal = normal[usable] / length[usable, None] * np.sign(along[usable])[:, None]
-    height = few @ normal.T - np.einsum("ij,ij->i", normal, three[usable, 0])
-    on = (np.abs(height) < tolerance).sum(axis=0)
-    below = (height < -3 * tolerance).sum(axis=0)
-    best = int(np.argmax(on - below))
-    up, offset = normal[best], float(normal[best] @ three[usable, 0][best])
+    at = np.einsum("ij,ij->i", normal, three[usable, 0])
+    best = int(np.argmax(_points_for(few, normal, at, tolerance)))
+    up, offset = normal[best], float(at[best])
     near = np.zeros(len(xyz), bool)
     for _ in range(5):
         near = np.abs(xyz @ up - offset) < tolerance
@@ -79,6 +78,19 @@ def ground_plane(
         up = vectors[:, 0] * (np.sign(vectors[:, 0] @ about) or 1.0)
         offset = float(up @ centre)
     return up, float(near.mean())
+
+
+def _points_for(xyz: Floats, normals: Floats, offsets: Floats, tolerance: float) -> Floats:
+    """Return for each plane the points on it less those well below it, (m,)."""
+    counts = np.empty(len(normals))
+    # heights above so many planes stay in the processor's cache
+    for start in range(0, len(normals), _PLANES_AT_ONCE):
+        some = slice(start, start + _PLANES_AT_ONCE)
+        height = normals[some] @ xyz.T
+        height -= offsets[some, None]
+        below = np.count_nonzero(height < -3 * tolerance, axis=1)
+        counts[some] = np.count_nonzero(np.abs(height, out=height) < tolerance, axis=1) - below
+    return counts
 
 
 @dataclass(frozen=True)

@@ -42,8 +42,8 @@ def one_line(result) -> str:
 
 def loaded_by(code: str) -> set[str]:
     """Return the modules that a fresh interpreter has loaded after some code."""
-    code = f"import sys\ntry:\n    {code}\nexcept SystemExit:\n    pass\nprint('\\n' + ' '.join(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    code = f"import sys\ntry:\n    {code}\nfinally:\n    print('\\n' + ' '.join(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     return set(done.stdout.splitlines()[-1].split())
 
 
@@ -67,6 +67,39 @@ def test_the_help_of_a_verb_loads_only_option_models(verb):
     rooms = {name.split(".")[1] for name in loaded if name.startswith("mtpcr_geo.")}
     assert rooms <= {"cli", "core", "pipeline"}
     assert not any(name.startswith("mtpcr_geo.benchmark") for name in loaded)
+
+
+def test_threads_and_what_is_to_be_done_at_the_end_are_done_and_the_status_is_kept():
+    code = """if True:
+        import atexit, sys, threading
+        from mtpcr_geo.cli.app import main
+        def late():
+            threading.main_thread().join()
+            print("thread", flush=True)
+        threading.Thread(target=late).start()
+        sys.argv = ["mtpcr-geo", "check", "no-such-file.laz"]
+        atexit.register(print, "at exit", end="")
+        main()
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 5
+    assert done.stdout.endswith("thread\nat exit")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="the system has no /dev/full")
+def test_output_that_cannot_be_written_is_told():
+    code = """if True:
+        import os, sys
+        from mtpcr_geo.cli.app import main
+        sys.argv = ["mtpcr-geo", "--version"]
+        main()
+    """
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert done.returncode != 0
+    assert "No space left" in done.stderr
 
 
 def test_help_names_every_verb():

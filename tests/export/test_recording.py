@@ -18,6 +18,7 @@ from helpers_scene import ORIGIN, make_pair, true_transform
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.recorder import NullRecorder, Recorder
 from mtpcr_geo.core.types import Pair
+from mtpcr_geo.export.recording import process as process_module
 from mtpcr_geo.export.recording import recorder as recorder_module
 from mtpcr_geo.export.recording import writer
 from mtpcr_geo.export.recording.budget import Budget
@@ -312,6 +313,31 @@ def test_the_other_process_ends_with_the_run(tmp_path):
     assert ended(int(done.stdout))
 
 
+def run_as_command(code: str, *arguments: object) -> str:
+    """Run Python code in a process that counts as the command, and return what it prints."""
+    head = (
+        "import sys; sys.argv[0] = '/usr/bin/mtpcr-geo'\n"
+        "from mtpcr_geo.export.recording import process; process.usable_cores = lambda: 2\n"
+    )
+    command = [sys.executable, "-c", head + code, *map(str, arguments)]
+    return subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=60, check=True).stdout
+
+
+def test_a_process_started_ahead_draws_the_recording(tmp_path):
+    code = (
+        "process.start_ahead(); pid = process._waiting.process.pid\n"
+        "from mtpcr_geo.export.recording.recorder import RerunRecorder\n"
+        "recorder = RerunRecorder(sys.argv[1]); recorder.begin({}); recorder._jobs[0].result()\n"
+        "print(pid == recorder._writer._process.pid); recorder.close(); print('rerun' in sys.modules)"
+    )
+    assert run_as_command(code, tmp_path / "a.rrd").split() == ["True", "False"]
+    assert (tmp_path / "a.rrd").stat().st_size > 0
+
+
+def test_a_process_started_ahead_in_vain_ends_with_the_run():
+    assert ended(int(run_as_command("process.start_ahead(); print(process._waiting.process.pid)")))
+
+
 @pytest.mark.parametrize(
     ("argv", "executable", "cores", "apart"),
     [
@@ -324,7 +350,7 @@ def test_the_other_process_ends_with_the_run(tmp_path):
 def test_only_a_command_draws_in_another_process(monkeypatch, argv, executable, cores, apart):
     monkeypatch.setattr(sys, "argv", argv)
     monkeypatch.setattr(sys, "executable", executable)
-    monkeypatch.setattr(recorder_module, "usable_cores", lambda: cores)
+    monkeypatch.setattr(process_module, "usable_cores", lambda: cores)
     monkeypatch.setattr(recorder_module, "_opened", False)
     monkeypatch.delitem(sys.modules, "rerun")
     assert recorder_module._pays_apart() is apart

@@ -8,6 +8,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.types import Bev, Hypothesis
 from mtpcr_geo.match.correlation import CorrelationSettings, match
+from mtpcr_geo.match.nearby import score_nearby
 from mtpcr_geo.match.patches import match_patches
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of, warp_to
 from mtpcr_geo.match.pyramid import search_factors
@@ -17,7 +18,6 @@ from mtpcr_geo.match.search import (
     all_yaws,
     angle_between,
     pairs_of_opposite,
-    score_nearby,
 )
 from mtpcr_geo.method.bev import grid_around, rasterise
 from mtpcr_geo.method.images import channels

@@ -13,9 +13,9 @@ from mtpcr_geo.core.types import Bev, Hypothesis, Matches
 from mtpcr_geo.match.candidates import Candidate, GroundWeights, Pool, same_pose
 from mtpcr_geo.match.correlation import CorrelationSettings, match, mirror
 from mtpcr_geo.match.exploration import Exploration, Step
+from mtpcr_geo.match.nearby import _sums_by_shifts, _sums_by_spectra
 from mtpcr_geo.match.pose import Pose
 from mtpcr_geo.match.prior import Prior
-from mtpcr_geo.match.search import _sums_by_shifts, _sums_by_spectra
 from mtpcr_geo.match.terrain import GroundComparison
 from mtpcr_geo.method.bev import grid_around, rasterise
 from mtpcr_geo.method.scales import Scales, scales_of

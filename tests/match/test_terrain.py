@@ -10,8 +10,9 @@ import pytest
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.types import Bev, Hypothesis
 from mtpcr_geo.match.exploration import CorrelationSettings, Exploration, Step
+from mtpcr_geo.match.nearby import score_nearby
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
-from mtpcr_geo.match.search import angle_between, score_nearby
+from mtpcr_geo.match.search import angle_between
 from mtpcr_geo.match.terrain import (
     FEWEST_CELLS,
     Terrain,

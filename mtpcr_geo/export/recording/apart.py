@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import os
 import pickle
-import subprocess
 import sys
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -21,14 +19,12 @@ import numpy as np
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import ArrayCloud, Cloud
 from mtpcr_geo.core.errors import OutputError
-from mtpcr_geo.core.imports import search_path
 from mtpcr_geo.core.types import Matches
 from mtpcr_geo.export.recording.budget import Budget
+from mtpcr_geo.export.recording.process import started
 
 if TYPE_CHECKING:
     from pyproj import CRS
-
-_START = "import sys; sys.path[:] = {path!r}; from mtpcr_geo.export.recording.apart import serve; serve()"
 
 
 class RemoteWriter:
@@ -46,15 +42,8 @@ class RemoteWriter:
 
     def __init__(self, path: Path, budget: Budget, seed: int) -> None:
         self._path = path
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the process
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _START.format(path=search_path())],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._said,
-            # what a terminal interrupts is the run; this one ends when the pipe does
-            process_group=0 if os.name == "posix" else None,
-        )
+        drawing = started()
+        self._process, self._said = drawing.process, drawing.said
         assert self._process.stdin is not None
         self._pickler = _Pickler(self._process.stdin)
         self._say("open", budget, seed)
@@ -121,12 +110,13 @@ def serve() -> None:
     made: bytes | Exception = b""
     reader = pickle.Unpickler(commands)
     try:
+        # before anything has come: this takes longest
+        from mtpcr_geo.export.recording.writer import RecordingWriter
+
         writer: Any = None
         while True:
             name, *arguments = reader.load()
             if name == "open":
-                from mtpcr_geo.export.recording.writer import RecordingWriter
-
                 writer = RecordingWriter(Path(), *arguments)
             elif name == "close":
                 made = writer.finished()

@@ -7,14 +7,13 @@ that stages hand on never change, so nothing has to be copied and the run hardly
 from __future__ import annotations
 
 import os
-import sys
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from mtpcr_geo.core.errors import OutputError
-from mtpcr_geo.core.system import command_line, usable_cores
 from mtpcr_geo.export.recording.budget import Budget
+from mtpcr_geo.export.recording.process import pays
 
 
 class RerunRecorder:
@@ -108,11 +107,7 @@ def _pays_apart() -> bool:
     """Return whether another process saves time: rerun is not imported here, and will not be needed again."""
     global _opened
     first, _opened = not _opened, True
-    # a program that only holds Python would start itself again
-    python = "python" in Path(sys.executable or "").name.lower() and not hasattr(sys, "frozen")
-    return (
-        first and python and command_line() is not None and usable_cores() > 1 and "rerun" not in sys.modules
-    )
+    return first and pays()
 
 
 _opened = False
