@@ -296,7 +296,7 @@ def _ending_at_once() -> Iterator[None]:
     """Leave it to the system to give back this process's memory at its end.
 
     Python would take down every module and array first, a fifth of a second after the last file is written.
-    What threads still do and all that is registered to be done at exit is done before.
+    What threads still do, and what was registered meanwhile to be done at exit, is done before.
     """
     status: list[int] = []
 

@@ -76,9 +76,9 @@ def test_threads_and_what_is_to_be_done_at_the_end_are_done_and_the_status_is_ke
         def late():
             threading.main_thread().join()
             print("thread", flush=True)
+            atexit.register(print, "at exit", end="")
         threading.Thread(target=late).start()
         sys.argv = ["mtpcr-geo", "check", "no-such-file.laz"]
-        atexit.register(print, "at exit", end="")
         main()
     """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
