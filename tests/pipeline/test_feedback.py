@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from helpers_scene import houses
 from mtpcr_geo import register
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.fits import IcpResult, IcpTrial, Refinement
-from mtpcr_geo.core.types import Bev, Pair, Side
+from mtpcr_geo.core.types import Bev, Matches, Pair, Side
 from mtpcr_geo.export.descriptions import transform_rows
 from mtpcr_geo.method.bev import make_bev
 from mtpcr_geo.method.refine import RefineSettings, refine
@@ -19,6 +20,7 @@ from mtpcr_geo.pipeline.stages.feedback import (
     CLOSER,
     _apart_m,
     borne_out,
+    fed_back,
     matched_coarser,
     refined_from_search,
 )
@@ -106,6 +108,43 @@ def few_of(pair: Pair) -> Pair:
 
 def raster(side: Side, cell: float) -> Bev:
     return make_bev(side.levelled_sample, cell)
+
+
+@dataclass(frozen=True)
+class WithoutStrength:
+    """The search, as a matcher whose strengths are not compared would tell of what it finds."""
+
+    matcher: Any
+    margin: float
+    needs_image: bool = False
+    needs_one_cell: bool = True
+
+    def match(self, *views: Any, **options: Any) -> Matches:
+        found: Matches = self.matcher.match(*views, **options)
+        return replace(found, strength=None, margin=self.margin)
+
+
+@pytest.mark.parametrize(("margin", "taken"), [(1.1, False), (4.0, True)])
+def test_a_vertical_is_borne_out_by_a_matcher_without_strengths_where_its_pose_stands_out(
+    registered, margin: float, taken: bool
+) -> None:
+    pair, T = registered
+    matcher = WithoutStrength(pair.matches.matcher, margin)
+    pair = pair.with_(matches=replace(pair.matches, strength=None, margin=3.0, matcher=matcher))
+    tilted = T @ transforms.compose(tilt_about_x(2.0), np.zeros(3))
+    found = fed_back(pair, refined_to(tilted), RefineSettings(), raster)
+    assert (found is not None) is taken
+
+
+def tilt_about_x(degrees: float) -> np.ndarray:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def refined_to(T: np.ndarray) -> Refinement:
+    """A refinement that ICP led to a transform, where the tie points no longer agree."""
+    icp = IcpResult(T, "gicp", 0.5, 1000, 1000, {"far": IcpTrial(0.9, 30)}, "far", True, lost_tie_points=True)
+    return Refinement(T, T, icp=icp)
 
 
 def test_the_pose_of_the_search_is_refined_where_tie_points_lead_elsewhere(registered) -> None:

@@ -18,6 +18,7 @@ from mtpcr_geo.export.descriptions import transform_rows
 from mtpcr_geo.match.base import Features
 from mtpcr_geo.match.descriptors import REMEMBERED, Remembering
 from mtpcr_geo.match.registry import Network
+from mtpcr_geo.pipeline.stages import second_opinion
 from mtpcr_geo.pipeline.stages.second_opinion import _significance, is_doubted, is_weak, matched_by_network
 
 NONE = np.empty((0, 2))
@@ -125,6 +126,15 @@ def test_significant_matches_replace_those_of_a_search_whose_margins_are_enough(
     strong = pair.with_(matches=replace(pair.matches, margin=3.0, null_ratio=3.0))
     found, _ = matched_by_network(strong, 0, Network(1), lambda n: None)
     assert found is not None
+
+
+def test_a_pose_under_which_the_scene_repeats_itself_is_not_taken(pair: Pair, monkeypatch) -> None:
+    # as if this town, which fits itself little, were rows of one house
+    monkeypatch.setattr(second_opinion, "REPEATS", -1.0)
+    found, margin = matched_by_network(pair, 0, Network(1), lambda n: None)
+    assert found is None
+    assert margin is not None
+    assert margin >= 1.3
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])

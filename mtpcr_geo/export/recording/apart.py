@@ -102,8 +102,6 @@ class RemoteWriter:
 
 def serve() -> None:
     """Make a recording of what comes by standard input, and give it by standard output. Ends with them."""
-    if hasattr(os, "nice"):  # not on Windows
-        os.nice(10)  # the run is what somebody waits for
     commands = sys.stdin.buffer
     reply = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever a library prints is no part of the reply
