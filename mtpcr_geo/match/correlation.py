@@ -10,6 +10,7 @@ what chance and self-similarity score on this pair.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
-from mtpcr_geo.core.system import opencv_in_one_thread
+from mtpcr_geo.core.system import opencv_in_one_thread, usable_cores
 from mtpcr_geo.core.types import Bev, Matches
 from mtpcr_geo.match.exploration import (
     CLEAR_LEAD,
@@ -33,6 +34,7 @@ from mtpcr_geo.match.pose import centre_of
 from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.pyramid import search_factors
 from mtpcr_geo.match.reasons import nothing_to_compare
+from mtpcr_geo.method.ground import bare
 from mtpcr_geo.method.scales import scales_of
 
 __all__ = ["CorrelationSettings", "exchanged", "match", "mirror"]
@@ -96,13 +98,28 @@ class _Search:
     ) -> None:
         self.source, self.target, self.settings, self.prior = source, target, settings, prior
         scales = scales_of(source, target)
-        self.found = Exploration(source, target, scales, settings, seed, advance, prior)
+        mirrored = mirror(source) if settings.mirrored_null else None
+        wanted = [bev for bev in (target, source, mirrored) if bev is not None]
+        with ThreadPoolExecutor(usable_cores()) as threads:
+            ground, *grounds = threads.map(bare, wanted)
+        self.found = Exploration(
+            source, target, scales, settings, seed, advance, prior, grounds=(grounds[0], ground)
+        )
         self.twin: Exploration | None = None
         self.settled = False
-        if settings.mirrored_null:
+        if mirrored is not None:
             null = None if prior is None else prior.mirrored()
             self.twin = Exploration(
-                mirror(source), target, scales, settings, seed, advance, null, self.found, MIRRORED_HYPOTHESES
+                mirrored,
+                target,
+                scales,
+                settings,
+                seed,
+                advance,
+                null,
+                self.found,
+                MIRRORED_HYPOTHESES,
+                (grounds[1], ground),
             )
 
     def search(self) -> None:

@@ -142,10 +142,11 @@ class Exploration:
         prior: Prior | None = None,
         beside: Exploration | None = None,
         first: int = HYPOTHESES,
+        grounds: tuple[Bev, Bev] | None = None,
     ) -> None:
         self.pyramid: Pyramid = Pyramid(source, target, None if beside is None else beside.pyramid)
         self.scales, self.settings, self.advance, self.prior = scales, settings, advance, prior
-        self.bare: tuple[Bev, Bev] = (bare(source), bare(target) if beside is None else beside.bare[1])
+        self.bare: tuple[Bev, Bev] = grounds or (bare(source), bare(target))
         self.ground_cell_m: float = (
             cell_to_compare(*self.bare, scales.terrain_cell_m) if beside is None else beside.ground_cell_m
         )

@@ -5,6 +5,8 @@ Only the part of the target under the source is compared, so that fine cells cos
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -147,14 +149,15 @@ def _sums_by_spectra(a: Image, e: Image, m: Image, stack: Image, window: int) ->
 
 def target_under(source: Grid, target: Grid, pose: Pose, margin: int) -> tuple[Grid, tuple[int, int]]:
     """Cut from the target's grid what the posed source can reach, plus a margin of cells."""
-    half_w, half_h = source.width * source.cell / 2, source.height * source.cell / 2
-    corners = np.array([[-half_w, -half_h], [half_w, -half_h], [half_w, half_h], [-half_w, half_h]])
-    c, s = np.cos(pose.yaw), np.sin(pose.yaw)
-    placed = corners @ np.array([[c, s], [-s, c]]) + [pose.east, pose.north]
-    px = target.to_pixel(placed)
-    column0 = int(np.clip(np.floor(px[:, 0].min()) - margin, 0, target.width))
-    row0 = int(np.clip(np.floor(px[:, 1].min()) - margin, 0, target.height))
-    column1 = int(np.clip(np.ceil(px[:, 0].max()) + margin + 1, column0, target.width))
-    row1 = int(np.clip(np.ceil(px[:, 1].max()) + margin + 1, row0, target.height))
+    # half of what the turned raster spans, in cells of the target, and where its centre lies
+    c, s, ratio = abs(math.cos(pose.yaw)), abs(math.sin(pose.yaw)), source.cell / target.cell / 2
+    across = ratio * (source.width * c + source.height * s)
+    down = ratio * (source.width * s + source.height * c)
+    column = (pose.east - target.west) / target.cell - 0.5
+    row = (target.north - pose.north) / target.cell - 0.5
+    column0 = min(max(math.floor(column - across) - margin, 0), target.width)
+    row0 = min(max(math.floor(row - down) - margin, 0), target.height)
+    column1 = min(max(math.ceil(column + across) + margin + 1, column0), target.width)
+    row1 = min(max(math.ceil(row + down) + margin + 1, row0), target.height)
     part = target.part(slice(row0, row1), slice(column0, column1))
     return part, (row0, column0)
