@@ -1,5 +1,5 @@
 """Run the command: ``python -m mtpcr_geo`` does what ``mtpcr-geo`` does."""
 
-from mtpcr_geo.cli.app import main
+from mtpcr_geo.cli.app import command
 
-main()
+command()

@@ -287,24 +287,24 @@ def main() -> None:
     # pydantic would read the metadata of every package installed, to look for plugins
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     signal.signal(signal.SIGTERM, _interrupt)
-    with _ending_at_once():
-        app(prog_name=NAME)
+    app(prog_name=NAME)
 
 
-@contextmanager
-def _ending_at_once() -> Iterator[None]:
-    """Leave it to the system to give back this process's memory at its end.
+def command() -> None:
+    """Run the command in a process that is there for nothing else.
 
-    Python would take down every module and array first, a fifth of a second after the last file is written.
-    What threads still do, and what was registered meanwhile to be done at exit, is done before.
+    It is left to the system to give back that process's memory at its end: Python would take down every
+    module and array first, a fifth of a second after the last file is written. What threads still do, and
+    what was registered meanwhile to be done at exit, is done before.
     """
     status: list[int] = []
 
     def end() -> None:
         if status:
             try:
-                sys.stdout.flush()
-                sys.stderr.flush()
+                for stream in (sys.stdout, sys.stderr):
+                    if stream is not None:  # closed before this process began
+                        stream.flush()
             except (OSError, ValueError):
                 return  # Python tells of it
             os._exit(status[0])
@@ -312,7 +312,7 @@ def _ending_at_once() -> Iterator[None]:
     # called last: what is registered later is called earlier
     atexit.register(end)
     try:
-        yield
+        main()
     except SystemExit as error:
         if error.code is None or isinstance(error.code, int):
             status.append(error.code or 0)

@@ -28,8 +28,13 @@ def run(options: RegisterVerb) -> None:
     """
     from mtpcr_geo.export.recording.process import start_ahead
 
-    if options.recording and options.threads != 1 and not options.dump_pipeline:
-        start_ahead()
+    if (
+        options.recording
+        and not options.dump_pipeline
+        and options.source.exists()
+        and options.target.exists()
+    ):
+        start_ahead(options.threads)
     from mtpcr_geo.cli.summary import SUMMARY_NEEDS, print_registration
     from mtpcr_geo.pipeline.grammar import dump
     from mtpcr_geo.registration import build_pipeline, read_options, register

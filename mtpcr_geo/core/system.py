@@ -154,7 +154,7 @@ def core_limit() -> int:
 
 _limit: int | None = None
 # numpy's BLAS and lazrs read these when they are first used
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 
 
 @contextmanager
@@ -175,10 +175,10 @@ def cores(most: int) -> Iterator[None]:
     import cv2
 
     before, of_opencv = _limit, cv2.getNumThreads()
-    variables = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    variables = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     _limit = most
     try:
-        os.environ.update(dict.fromkeys(_THREAD_VARIABLES, str(usable_cores())))
+        os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(usable_cores())))
         cv2.setNumThreads(usable_cores())
         yield
     finally:

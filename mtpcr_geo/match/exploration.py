@@ -146,7 +146,10 @@ class Exploration:
     ) -> None:
         self.pyramid: Pyramid = Pyramid(source, target, None if beside is None else beside.pyramid)
         self.scales, self.settings, self.advance, self.prior = scales, settings, advance, prior
-        self.bare: tuple[Bev, Bev] = grounds or (bare(source), bare(target))
+        self.bare: tuple[Bev, Bev] = grounds or (
+            bare(source),
+            bare(target) if beside is None else beside.bare[1],
+        )
         self.ground_cell_m: float = (
             cell_to_compare(*self.bare, scales.terrain_cell_m) if beside is None else beside.ground_cell_m
         )

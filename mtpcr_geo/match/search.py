@@ -109,6 +109,7 @@ class GlobalSearch:
         self._shape = (cv2.getOptimalDFTSize(height + side - 1), cv2.getOptimalDFTSize(width + side - 1))
         self._room = _Room(self._shape)
         self._target_spectra = [one.copy() for one in self._spectra(target.channels.stack)]
+        self._room = _Room(self._shape)  # what this thread has used is let go of
         self._allowed: Callable[[float], NDArray[np.bool_]] | None = None
 
     def restrict(self, place: Callable[[float], tuple[float, float]], radius: float) -> None:

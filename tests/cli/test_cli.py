@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -72,27 +74,48 @@ def test_the_help_of_a_verb_loads_only_option_models(verb):
 def test_threads_and_what_is_to_be_done_at_the_end_are_done_and_the_status_is_kept():
     code = """if True:
         import atexit, sys, threading
-        from mtpcr_geo.cli.app import main
+        from mtpcr_geo.cli.app import command
         def late():
             threading.main_thread().join()
             print("thread", flush=True)
             atexit.register(print, "at exit", end="")
         threading.Thread(target=late).start()
         sys.argv = ["mtpcr-geo", "check", "no-such-file.laz"]
-        main()
+        command()
     """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 5
     assert done.stdout.endswith("thread\nat exit")
 
 
+def test_whoever_calls_main_ends_as_it_likes():
+    code = """if True:
+        import atexit, sys
+        atexit.register(print, "done")
+        from mtpcr_geo.cli.app import main
+        try:
+            main()
+        except SystemExit:
+            sys.exit(7)
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (7, "done\n")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="closes standard output as a shell does")
+def test_a_closed_standard_output_is_nothing_to_tell_of():
+    command = f"{shlex.quote(sys.executable)} -m mtpcr_geo --version >&-"
+    done = subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="the system has no /dev/full")
 def test_output_that_cannot_be_written_is_told():
     code = """if True:
         import os, sys
-        from mtpcr_geo.cli.app import main
+        from mtpcr_geo.cli.app import command
         sys.argv = ["mtpcr-geo", "--version"]
-        main()
+        command()
     """
     with open("/dev/full", "w") as full:
         done = subprocess.run(

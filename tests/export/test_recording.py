@@ -334,6 +334,25 @@ def test_a_process_started_ahead_draws_the_recording(tmp_path):
     assert (tmp_path / "a.rrd").stat().st_size > 0
 
 
+def test_a_process_started_ahead_that_has_ended_is_replaced():
+    code = (
+        "process.start_ahead(); one = process._waiting; one.process.kill(); one.process.wait()\n"
+        "other = process.started(); print(other.process.poll() is None); other.discard()"
+    )
+    assert run_as_command(code) == "True\n"
+
+
+def test_a_process_started_ahead_uses_no_more_cores_than_the_run():
+    code = (
+        "process.usable_cores = lambda: 8; process.start_ahead(2)\n"
+        "environment = open(f'/proc/{process._waiting.process.pid}/environ').read().split(chr(0))\n"
+        "print(sorted(one for one in environment if one.endswith('_NUM_THREADS=2')))"
+    )
+    if not Path("/proc/self/environ").exists():
+        pytest.skip("the system does not show a process's environment")
+    assert run_as_command(code).count("_NUM_THREADS=2") == 4
+
+
 def test_a_process_started_ahead_in_vain_ends_with_the_run():
     assert ended(int(run_as_command("process.start_ahead(); print(process._waiting.process.pid)")))
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO
 
 from mtpcr_geo.core.imports import search_path
-from mtpcr_geo.core.system import command_line, usable_cores
+from mtpcr_geo.core.system import THREAD_VARIABLES, command_line, usable_cores
 
 _START = "import sys; sys.path[:] = {path!r}; from mtpcr_geo.export.recording.apart import serve; serve()"
 
@@ -50,18 +50,25 @@ def started() -> Drawing:
         return _start()
     drawing, _waiting = _waiting, None
     atexit.unregister(drawing.discard)
-    return drawing
+    if drawing.process.poll() is None:
+        return drawing
+    drawing.discard()
+    return _start()
 
 
-def start_ahead() -> None:
+def start_ahead(threads: int = 0) -> None:
     """Start the process now, where a recording will be drawn by one, so that it imports rerun meanwhile.
 
     It ends with this process at the latest.
+
+    Args:
+        threads: cores that the run, and so the process, may use; all if 0.
+
     """
     global _waiting
-    if _waiting is None and pays():
+    if _waiting is None and threads != 1 and pays():
         try:
-            _waiting = _start()
+            _waiting = _start(threads)
         except OSError:  # no more processes are allowed; asked again when it is needed
             return
         atexit.register(_waiting.discard)
@@ -74,7 +81,9 @@ def pays() -> bool:
     return python and command_line() is not None and usable_cores() > 1 and "rerun" not in sys.modules
 
 
-def _start() -> Drawing:
+def _start(threads: int = 0) -> Drawing:
+    # where the run is limited already, its environment says so
+    limits = dict.fromkeys(THREAD_VARIABLES, str(min(threads, usable_cores()))) if threads else {}
     said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the process
     try:
         process = subprocess.Popen(
@@ -82,6 +91,7 @@ def _start() -> Drawing:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=said,
+            env={**os.environ, **limits},
             # what a terminal interrupts is the run; this one ends when the pipe does
             process_group=0 if os.name == "posix" else None,
         )
