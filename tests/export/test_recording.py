@@ -345,8 +345,10 @@ def test_a_process_started_ahead_that_has_ended_is_replaced():
 def test_a_process_started_ahead_uses_no_more_cores_than_the_run():
     code = (
         "process.usable_cores = lambda: 8; process.start_ahead(2)\n"
-        "environment = open(f'/proc/{process._waiting.process.pid}/environ').read().split(chr(0))\n"
-        "print(sorted(one for one in environment if one.endswith('_NUM_THREADS=2')))"
+        "path = f'/proc/{process._waiting.process.pid}/environ'\n"
+        # empty until the program is loaded
+        "while not (environment := open(path).read()): pass\n"
+        "print([one for one in environment.split(chr(0)) if one.endswith('_NUM_THREADS=2')])"
     )
     if not Path("/proc/self/environ").exists():
         pytest.skip("the system does not show a process's environment")
