@@ -225,6 +225,7 @@ class Matches(ComparesArrays):
         null_ratio: strength of the best hypothesis over the best of the mirrored source; None likewise.
         mirrored_strengths: strengths of the mirrored source's hypotheses; None where it was not searched.
         repeats: whether the scene under the best hypothesis fits itself after a shift, as rows do.
+        self_likeness: correlation of that scene with itself, moved; None from matchers that do not tell.
         report: further figures of the matcher, for the audit only.
         source_keypoints, target_keypoints: (k, 2) pixels of all keypoints, matched or not; None from
             matchers that have none.
@@ -247,6 +248,7 @@ class Matches(ComparesArrays):
     strength: float | None = None
     mirrored_strengths: tuple[float, ...] | None = None
     repeats: bool = False
+    self_likeness: float | None = None
     report: Mapping[str, Any] = field(default_factory=dict)
     source_keypoints: Floats | None = None
     target_keypoints: Floats | None = None

@@ -45,6 +45,7 @@ _LABELS = {
     "ground_relief_m": "ground, relief",
     "ground_noise_m": "ground, spread that its noise explains",
     "repeats": "scene repeats itself",
+    "self_likeness": "correlation of the scene with itself, moved",
     "probability": "probability of being right (5 degrees, 2 m)",
     "probability_precise": "probability of being precise (0.2 degrees, 0.5 m)",
     "refinement_lost": "refinement lost the tie points",

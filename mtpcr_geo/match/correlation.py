@@ -194,6 +194,7 @@ class _Search:
             strength=best.strength,
             mirrored_strengths=None if twin is None else tuple(c.strength for c in twin.pool.candidates),
             repeats=search.repeats(),
+            self_likeness=search.likeness,
             report=self._report(patches.patches, radius, twin, null_ratio),
             search_further=self._further if left_off else None,
         )

@@ -15,7 +15,7 @@ from mtpcr_geo.verdict.findings import (
     probability_text,
 )
 from mtpcr_geo.verdict.limits import Evidence, Limits
-from mtpcr_geo.verdict.probability import LEAST_GROUND_NOISE_M
+from mtpcr_geo.verdict.probability import LEAST_GROUND_NOISE_M, may_repeat
 from mtpcr_geo.verdict.sliding import weakness_text
 
 MOST_CONFLICTS = 0.25
@@ -158,8 +158,8 @@ def _ground_shape(evidence: Evidence, limits: Limits) -> Check:
     if spread is None or relief is None:
         return Check("ground shape", "too little ground", "its relief followed", None, meaning)
     most = max(limits.ground_shape * relief, FLAT_GROUND_M)
-    if evidence.repeats and evidence.ground_noise_m is not None:
-        meaning += " Where the scene repeats itself, it must agree to a multiple of its noise."
+    if may_repeat(evidence.repeats, evidence.self_likeness) and evidence.ground_noise_m is not None:
+        meaning += " Where the scene repeats itself, or may, it must agree to a multiple of its noise."
         most = min(most, limits.ground_noise_of_rows * max(evidence.ground_noise_m, LEAST_GROUND_NOISE_M))
     value, wanted = beside(spread, most, 2)
     return Check("ground shape", f"{value} m, relief {relief:.2f} m", f"at most {wanted} m", True, meaning)

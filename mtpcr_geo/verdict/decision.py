@@ -118,6 +118,7 @@ def metrics_of(evidence: Evidence) -> dict[str, Any]:
         "ground_relief_m": evidence.ground_relief_m,
         "ground_noise_m": evidence.ground_noise_m,
         "repeats": evidence.repeats,
+        "self_likeness": evidence.self_likeness,
         "objects_missing": evidence.objects_missing,
         "refined_away_m": evidence.refined_away_m,
         "refinement_lost": evidence.refinement_lost,

@@ -78,6 +78,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         ground_relief_m=shape.relief_m if np.isfinite(shape.spread_m) else None,
         ground_noise_m=shape.noise_m if np.isfinite(shape.spread_m) else None,
         repeats=matches is not None and matches.repeats,
+        self_likeness=matches.self_likeness if matches is not None else None,
         refined_away_m=_refined_away(pair, T),
         refinement_lost=icp is not None and icp.lost_tie_points,
         null_ratio=matches.null_ratio if matches is not None else None,

@@ -8,7 +8,7 @@ from mtpcr_geo.core.statistics import neg_log10_p
 from mtpcr_geo.core.types import Rival
 from mtpcr_geo.core.wording import beside, only, percent
 from mtpcr_geo.verdict.limits import Evidence, Limits
-from mtpcr_geo.verdict.probability import rows_over_noise
+from mtpcr_geo.verdict.probability import may_repeat, rows_over_noise
 
 FEWEST_GROUND_CELLS = 30
 FEWEST_HELD_OUT = 4
@@ -254,16 +254,18 @@ def ground_shape_finding(evidence: Evidence, limits: Limits) -> CheckFinding | N
 
 
 def terrain_of_rows_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
-    """Judge, where the scene repeats itself, whether the ground agrees as far as its noise lets one see.
+    """Judge, where the scene may repeat itself, whether the ground agrees as far as its noise lets one see.
 
     Among rows the terrain decides, and of many places with the same rows on gentle terrain one fits by
     chance, though not to the noise.
     """
-    ratio = rows_over_noise(evidence.repeats, evidence.ground_spread_m, evidence.ground_noise_m)
+    rows = may_repeat(evidence.repeats, evidence.self_likeness)
+    ratio = rows_over_noise(rows, evidence.ground_spread_m, evidence.ground_noise_m)
     if ratio is None or ratio <= limits.ground_noise_of_rows:
         return None
+    does = "repeats" if evidence.repeats else "may repeat"
     return CheckFinding(
-        f"the scene repeats itself, and the ground beneath it differs by {evidence.ground_spread_m:.2f} m, "
+        f"the scene {does} itself, and the ground beneath it differs by {evidence.ground_spread_m:.2f} m, "
         f"{ratio:.0f} times what its noise explains (wanted at most {limits.ground_noise_of_rows:g}): other "
         "rows on similar terrain look so; give more of what lies around it, or say where it is (--near)"
     )

@@ -38,6 +38,7 @@ class Evidence:
             grounds, relief that they have, and spread that their noise explains, metres, see
             `method.overlap.GroundShape`; None where it was not to be told.
         repeats: whether the scene under the pose fits itself after a shift, as rows do.
+        self_likeness: correlation of that scene with itself, moved; None where that is not known.
         refined_away_m: how far the refinement ended from where the tie points had led, in plan, metres.
         final_agreeing: of all tie points, those that agree with the final transform; None if not counted.
         refinement_lost: whether surfaces fit better where the tie points do not agree, and the tie points
@@ -78,6 +79,7 @@ class Evidence:
     ground_relief_m: float | None = None
     ground_noise_m: float | None = None
     repeats: bool = False
+    self_likeness: float | None = None
     missing: str | None = None
     rivals: tuple[Rival, ...] = ()
     mapped: bool = True

@@ -51,14 +51,20 @@ UNIQUE = ("mirror", "objects", "rows")
 - mirror: logarithm of the strength over the best of the mirrored source, up to where it is clear of it: a
   scene without a right pose reaches as much, and most sites that fit themselves after half a turn do;
 - objects: minus the share of one cloud's objects at whose place the other sees bare ground;
-- rows: where the scene repeats itself, minus the logarithm of the ground's spread over its noise, from
-  `ROWS_OVER_NOISE` on: of many places with the same rows the terrain of one fits by chance, not to the noise.
+- rows: where the scene repeats itself, or may, minus the logarithm of the ground's spread over its noise,
+  from `ROWS_OVER_NOISE` on: of many places with the same rows the terrain of one fits by chance, not to the
+  noise.
 """
 
 ROWS_OVER_NOISE, LEAST_GROUND_NOISE_M, MOST_OF_ROWS = 10.0, 0.0025, 1.5
 """Spread of the ground over its noise that right poses among rows hardly exceed (11 at most), the least noise
 that is believed, and logarithm of that ratio over the first beyond which more says no more."""
 
+
+MAY_REPEAT = 0.3
+"""Correlation of a scene with itself, moved, from which it may be rows. It is below
+`mtpcr_geo.match.repetition.REPEATS`, since young and missing trees make an orchard less like itself, and right
+poses of any site fit to a few times the noise."""
 
 PRECISE = ("plan", "rotation")
 """What says that a right pose is precise: logarithms of the tolerance over what 95 % of the errors in plan
@@ -88,7 +94,8 @@ def features_of(metrics: Mapping[str, Any]) -> Floats | None:
     shape = 0.0
     if spread is not None and relief is not None:
         shape = float(np.clip(np.log((relief + RELIEF_NOISE_M) / (spread + RELIEF_NOISE_M)), *GROUND_CLEAR))
-    over_noise = rows_over_noise(bool(metrics.get("repeats")), spread, metrics.get("ground_noise_m"))
+    rows = may_repeat(bool(metrics.get("repeats")), metrics.get("self_likeness"))
+    over_noise = rows_over_noise(rows, spread, metrics.get("ground_noise_m"))
     of_rows = 0.0 if over_noise is None else float(np.log(over_noise / ROWS_OVER_NOISE))
     cells = metrics.get("ground_cells") or 0
     share = (metrics.get("ground_agreeing") or 0) / max(cells, 1) - GROUND_EXPECTED
@@ -106,9 +113,14 @@ def features_of(metrics: Mapping[str, Any]) -> Floats | None:
     )
 
 
-def rows_over_noise(repeats: bool, spread_m: float | None, noise_m: float | None) -> float | None:
-    """Return the ground's spread over its noise; None if that is unknown, or nothing repeats."""
-    if not repeats or spread_m is None or noise_m is None or spread_m <= 0.0:
+def may_repeat(repeats: bool, self_likeness: float | None) -> bool:
+    """Return whether a scene repeats itself, or so nearly that it may be rows."""
+    return repeats or (self_likeness is not None and self_likeness >= MAY_REPEAT)
+
+
+def rows_over_noise(rows: bool, spread_m: float | None, noise_m: float | None) -> float | None:
+    """Return the ground's spread over its noise; None if that is unknown, or there can be no rows."""
+    if not rows or spread_m is None or noise_m is None or spread_m <= 0.0:
         return None
     return spread_m / max(noise_m, LEAST_GROUND_NOISE_M)
 

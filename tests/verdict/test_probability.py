@@ -108,6 +108,22 @@ def test_among_rows_the_ground_must_agree_to_its_noise() -> None:
     assert assess(replace(by_chance, ground_noise_m=None), Limits()).name == "accepted"
 
 
+def test_a_scene_that_may_be_rows_is_held_to_the_noise_of_its_ground_too() -> None:
+    # an orchard with young and missing trees, of which another place was accepted
+    orchard = replace(CLEAR, self_likeness=0.36, ground_spread_m=0.147, ground_relief_m=0.25)
+    verdict = assess(replace(orchard, ground_noise_m=0.0062), Limits())
+    assert verdict.name != "accepted"
+    assert any("may repeat itself" in reason for reason in verdict.reasons)
+    assert verdict.metrics["self_likeness"] == 0.36
+    assert verdict.metrics["probability"] < 0.5
+    # the right place of any site agrees to a few times its noise
+    right = replace(orchard, ground_spread_m=0.02, ground_noise_m=0.0062)
+    assert assess(right, Limits()).name == "accepted"
+    assert probability(self_likeness=0.36, ground_spread_m=0.147, ground_noise_m=0.0062) < probability(
+        self_likeness=0.28, ground_spread_m=0.147, ground_noise_m=0.0062
+    )
+
+
 def test_too_few_tie_points_are_never_accepted_however_clear_the_rest() -> None:
     verdict = assess(replace(CLEAR, margin=20.0, null_ratio=20.0, held_out=3, held_out_agreeing=3), Limits())
     assert verdict.name == "doubtful"
