@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import typer
 
 from mtpcr_geo.cli.options import RegisterVerb
@@ -28,12 +30,9 @@ def run(options: RegisterVerb) -> None:
     """
     from mtpcr_geo.export.recording.process import start_ahead
 
-    if (
-        options.recording
-        and not options.dump_pipeline
-        and options.source.exists()
-        and options.target.exists()
-    ):
+    # not Path.exists, which raises for names that no system allows
+    readable = os.path.exists(options.source) and os.path.exists(options.target)
+    if options.recording and readable and not options.dump_pipeline:
         start_ahead(options.threads)
     from mtpcr_geo.cli.summary import SUMMARY_NEEDS, print_registration
     from mtpcr_geo.pipeline.grammar import dump

@@ -63,8 +63,8 @@ that is believed, and logarithm of that ratio over the first beyond which more s
 
 MAY_REPEAT = 0.3
 """Correlation of a scene with itself, moved, from which it may be rows. It is below
-`mtpcr_geo.match.repetition.REPEATS`, since young and missing trees make an orchard less like itself, and right
-poses of any site fit to a few times the noise."""
+`mtpcr_geo.match.repetition.REPEATS`, since young and missing trees make an orchard less like itself, and
+right poses of any site fit to a few times the noise."""
 
 PRECISE = ("plan", "rotation")
 """What says that a right pose is precise: logarithms of the tolerance over what 95 % of the errors in plan
