@@ -111,7 +111,7 @@ The metrics:
   the blocks; null if unknown
 - ``metrics.repeats``: whether the scene under the pose fits itself after a shift, as rows do
 - ``metrics.self_likeness``: correlation of that scene with itself, moved: from 0.3 on it may be rows; null
-  from keypoints
+  where a matcher of keypoints was asked for
 - ``metrics.probability``: probability of being within 5 degrees and 2 m of the truth, from a model fitted to
   runs of known answer; null from keypoints
 - ``metrics.probability_precise``: the same of being within 0.2 degrees and 0.5 m, from that and from the

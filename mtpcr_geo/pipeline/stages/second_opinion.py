@@ -97,10 +97,13 @@ def matched_by_network(
     if not is_doubted(first) and _significance(found, views[0].bev, views[1].bev) < limits.neg_log10_p:
         return None, found.margin
     layers = Pyramid(views[0].bev, views[1].bev).at(1)
-    if self_likeness(*layers, pose_of(found.hypotheses[0], centre_of(layers[0].grid))) >= REPEATS:
+    likeness = self_likeness(*layers, pose_of(found.hypotheses[0], centre_of(layers[0].grid)))
+    if likeness >= REPEATS:
         return None, found.margin
     report = {**found.report, "second_opinion": {"margin": found.margin, "taken": True}}
-    matches = replace(found, matcher=network.matcher(remembering=False), report=report)
+    matches = replace(
+        found, self_likeness=likeness, matcher=network.matcher(remembering=False), report=report
+    )
     return pair.with_(source=sides[0], target=sides[1], matches=matches), found.margin
 
 
