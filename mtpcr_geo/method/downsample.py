@@ -12,6 +12,10 @@ MAX_VOXELS = 30_000_000
 DENSE_VOXELS = 2.5
 """Mean points a voxel above which voxels give their mean point, and below which all points are taken."""
 
+AXES_POINTS = 200_000
+SHARES = 8
+"""Shares of the points kept, from one to its double."""
+
 _BLOCK = 131_072
 
 LATTICE_M = 0.00037
@@ -53,36 +57,69 @@ def _voxels(xyz: Floats, low: Floats, edge: float) -> tuple[NDArray[np.int64], .
     return tuple(np.floor((xyz - low) / edge).astype(np.int64).T)
 
 
-def thinned(xyz: Floats, number: NDArray[np.int64], voxel: float, max_points: int) -> Floats:
+def own_axes(xyz: Floats) -> Floats:
+    """Return the frame of a cloud's own principal axes, which goes along wherever the cloud is moved.
+
+    The origin is the centroid. Axes run along greatest, middle and least spread, the first two to the side
+    on which the points reach farther (third moments). Of points that spread alike in all directions the axes
+    are arbitrary. Of many points every so many are looked at.
+
+    Args:
+        xyz: (n, 3) points, metres; n > 0.
+
+    Returns:
+        4x4 from the points' coordinates to those along their axes.
+
+    """
+    some = xyz[:: -(-len(xyz) // AXES_POINTS)]
+    middle = transforms.centroid(some)
+    some = some - middle
+    axes = np.linalg.eigh(some.T @ some)[1][:, ::-1].T
+    axes[((some @ axes.T) ** 3).sum(axis=0) < 0.0] *= -1.0
+    axes[2] = np.cross(axes[0], axes[1])
+    return transforms.compose(axes, -axes @ middle)
+
+
+def thinned(
+    xyz: Floats, number: NDArray[np.int64], voxel: float, max_points: int, T_axes: Floats
+) -> tuple[Floats, Floats]:
     """Thin points to at most `max_points`, in a way that depends only on the points and not on the frame.
 
     Dense clouds give one mean point a voxel. Where voxels would hold hardly more than a point each, the
-    points are taken as they are, since a lattice of voxels in another CRS would cut them otherwise. What is
-    too many is left out by a hash of the voxel, or of the point's number: if one comes or goes, the choice
-    among all others stays.
+    points are taken as they are, since another lattice of voxels would cut them otherwise. What is too many
+    is left out by a hash of the voxel, or of the point's number: if one comes or goes, the choice among all
+    others stays.
 
     Args:
         xyz: (n, 3) points, metres.
         number: (n,) the points' numbers in their cloud.
         voxel: edge of a voxel, metres.
         max_points: points at most.
+        T_axes: 4x4 to the frame in which voxels lie, see `own_axes`.
 
     Returns:
-        (m, 3) metres.
+        (m, 3) metres, and for each point its lot, (m,) from 0 to 1: those below a share are that share of
+        the points, chosen as evenly and as lastingly as the points themselves.
 
     """
     import small_gicp
 
-    first = np.floor(transforms.bounds(xyz)[0] / voxel) - 1
+    placed = transforms.apply(T_axes, xyz)
+    first = np.floor(transforms.bounds(placed)[0] / voxel) - 1
     corner = first * voxel + LATTICE_M
-    thin = np.asarray(small_gicp.voxelgrid_sampling(xyz - corner, voxel, 1).points())[:, :3]
+    placed -= corner
+    thin = np.asarray(small_gicp.voxelgrid_sampling(placed, voxel, 1).points())[:, :3]
     if len(xyz) < DENSE_VOXELS * len(thin):
-        names, thin = number[:, None], xyz - corner
+        names, thin = number[:, None], placed
     else:
         names = (np.floor(thin / voxel) + first).astype(np.int64)
+    lots = _hash(names).astype(np.float64) * 2.0**-64
     if len(thin) > max_points:
-        thin = thin[np.sort(np.argpartition(_hash(names), max_points)[:max_points])]
-    return thin + corner
+        # the share moves by steps, so that a few points more or less in the overlap change no choice
+        share = 2.0 ** (np.floor(SHARES * np.log2(max_points / len(thin))) / SHARES)
+        kept = lots < share
+        thin, lots = thin[kept], lots[kept] / share
+    return transforms.apply(transforms.inverse(T_axes), thin + corner), lots
 
 
 def _hash(names: NDArray[np.int64]) -> NDArray[np.uint64]:

@@ -20,6 +20,8 @@ from mtpcr_geo.core.types import IcpMethod
 ALONG_NORMAL = 1e-3
 """Variance of a surface along its normal, as a share of that across it (the paper's epsilon)."""
 FEWEST_PARTNERS = 6
+GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
+"""Multiples of this, less their whole part, spread evenly, however many there are."""
 _HAIR_M = 1e-9  # rounding could tip what is nearly halfway
 DAMPING, DAMPING_FACTOR, LEAST_DAMPING, MOST_TRIES = 1e-3, 10.0, 1e-9, 10
 """Damping of Levenberg and Marquardt's step at first, by what it changes, where it stops falling, and how
@@ -131,11 +133,14 @@ class Descender:
     Args:
         source, target: both surfaces, in coordinates near their middle.
         tree: small_gicp's KdTree of the target's points.
+        lots: (n,) from 0 to 1, of the source's points: where a share of them does, it is those below it;
+            if None, points are taken evenly by their number.
 
     """
 
-    def __init__(self, source: Surface, target: Surface, tree: Any) -> None:
+    def __init__(self, source: Surface, target: Surface, tree: Any, lots: Floats | None = None) -> None:
         self.source, self.target, self._tree = source, target, tree
+        self._lots = np.arange(len(source.points)) * GOLDEN % 1.0 if lots is None else lots
 
     def descend(
         self,
@@ -158,7 +163,7 @@ class Descender:
             iterations: at most.
             still_rad, still_m: a step below both ends it.
             among: (k,) points of the source to use; all if None.
-            enough: partners that do at the start: of more, every so many points are left out; None uses all.
+            enough: partners that do at the start: of more, only a share is used; None uses all.
 
         """
         which = np.arange(len(self.source.points)) if among is None else among
@@ -166,8 +171,7 @@ class Descender:
         partners = Partners(self._tree, self.target.points, points, within_m)
         every = 1 if enough is None else len(partners.of(T)[0]) // enough
         if every > 1:
-            # by number, so that one point more or less does not change the choice of all others
-            few = which % every == 0
+            few = self._lots[which] * every < 1.0
             points, normals = points[few], normals[few]
             partners = Partners(self._tree, self.target.points, points, within_m)
         damping, inliers = DAMPING, 0

@@ -14,7 +14,7 @@ from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import IcpMethod, IcpRound
 from mtpcr_geo.core.wording import only
-from mtpcr_geo.method.downsample import near, thinned
+from mtpcr_geo.method.downsample import near, own_axes, thinned
 from mtpcr_geo.method.gicp import Descender, Surface, weighing
 from mtpcr_geo.method.neighbourhoods import local_shapes
 from mtpcr_geo.method.overlap import overlap_of
@@ -147,15 +147,19 @@ class Surfaces:
         self.voxel_m = voxel_m
         self._threads = threads or usable_cores()
         self._pivot = np.floor(transforms.centroid(target[of_target]))
-        # each cloud is thinned in its own frame, so that a hair's breadth at the start changes no point
-        s = transforms.apply(T_start, thinned(source[of_source], of_source, voxel_m, max_points))
-        t = thinned(target[of_target], of_target, voxel_m, 3 * max_points)
+        # each cloud is thinned along its own axes: how either is turned, and a hair's breadth at the start,
+        # change no point
+        (s, lots), (t, _) = (
+            thinned(cloud[rows], rows, voxel_m, most, own_axes(cloud))
+            for cloud, rows, most in ((source, of_source, max_points), (target, of_target, 3 * max_points))
+        )
+        s = transforms.apply(T_start, s)
         if min(len(s), len(t)) < FEWEST_THINNED:
             raise RegistrationError(
                 f"the overlap holds points in {only(min(len(s), len(t)), 'cell')} of {voxel_m:g} m only, and "
                 f"{FEWEST_THINNED} are needed to refine the pose: it brings hardly any of the clouds together"
             )
-        self._s, self._t = s - self._pivot, t - self._pivot
+        self._s, self._t, self._lots = s - self._pivot, t - self._pivot, lots
         self._source, self._target = small_gicp.PointCloud(self._s), small_gicp.PointCloud(self._t)
         self._source_tree = self._with_surfaces(self._source)
         self._tree = self._with_surfaces(self._target)
@@ -268,12 +272,12 @@ class Surfaces:
             Surface(points, np.asarray(cloud.normals())[:, :3])
             for points, cloud in ((self._s, self._source), (self._t, self._target))
         )
-        return Descender(source, target, self._tree)
+        return Descender(source, target, self._tree, self._lots)
 
     @cached_property
     def _probes(self) -> tuple[Floats, Floats]:
         """Flat places of the source, (n, 3), and their unit normals, (n, 3)."""
-        chosen = np.arange(0, len(self._s), max(len(self._s) // PROBES, 1))
+        chosen = np.flatnonzero(self._lots * max(len(self._s) // PROBES, 1) < 1.0)
         spread, axes = local_shapes(self._source_tree, self._s, self._s[chosen], NEIGHBOURS, self._threads)
         flat = spread[:, 1] > FLAT * spread[:, 0]
         return self._s[chosen[flat]], axes[flat, :, 0]

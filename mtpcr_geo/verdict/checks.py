@@ -12,6 +12,7 @@ from mtpcr_geo.verdict.findings import (
     FLAT_GROUND_M,
     ground_checked,
     neg_log10_p_of,
+    noise_of_rows,
     probability_text,
 )
 from mtpcr_geo.verdict.limits import Evidence, Limits
@@ -160,7 +161,7 @@ def _ground_shape(evidence: Evidence, limits: Limits) -> Check:
     most = max(limits.ground_shape * relief, FLAT_GROUND_M)
     if may_repeat(evidence.repeats, evidence.self_likeness) and evidence.ground_noise_m is not None:
         meaning += " Where the scene repeats itself, or may, it must agree to a multiple of its noise."
-        most = min(most, limits.ground_noise_of_rows * max(evidence.ground_noise_m, LEAST_GROUND_NOISE_M))
+        most = min(most, noise_of_rows(evidence, limits) * max(evidence.ground_noise_m, LEAST_GROUND_NOISE_M))
     value, wanted = beside(spread, most, 2)
     return Check("ground shape", f"{value} m, relief {relief:.2f} m", f"at most {wanted} m", True, meaning)
 

@@ -119,7 +119,8 @@ class Limits:
             large: crops and brush of one of two dates spread the ground of the right place by 0.4 to 0.8.
         ground_noise_of_rows: where the scene repeats itself, most spread of the height differences between
             both grounds, as a multiple of their noise, to accept: under 46 right poses of simulated rows it
-            is 3 to 11, under 50 wrong ones 14 and more but for three.
+            is 3 to 11, under 50 wrong ones 14 and more but for three. Less, in proportion, where fewer than
+            `mtpcr_geo.verdict.findings.MOST_AGREE` of the tie points agree.
         objects_missing: greatest share of objects missing in the other cloud to accept.
 
     """

@@ -124,6 +124,24 @@ def test_a_scene_that_may_be_rows_is_held_to_the_noise_of_its_ground_too() -> No
     )
 
 
+def test_among_rows_the_ground_must_agree_the_better_the_fewer_tie_points_do() -> None:
+    # a vineyard without its right place, which was accepted: the ground fits nearly as well as right ones
+    vineyard = replace(
+        CLEAR, repeats=True, self_likeness=0.47, margin=2.33, null_ratio=2.92, held_out=85,
+        held_out_agreeing=30, ground_spread_m=0.0372, ground_relief_m=0.17, ground_noise_m=0.00316,
+    )  # fmt: skip
+    verdict = assess(vineyard, Limits())
+    assert verdict.name != "accepted"
+    assert any("30 of 85" in reason and "repeats itself" in reason for reason in verdict.reasons)
+    (shape,) = (check for check in verdict.checks if check.name == "ground shape")
+    assert (shape.passed, shape.wanted) == (False, "at most 0.02 m")
+    for agreeing, spread, name in ((60, 0.0372, "accepted"), (44, 0.028, "accepted"), (30, 0.02, "accepted")):
+        assert (
+            assess(replace(vineyard, held_out_agreeing=agreeing, ground_spread_m=spread), Limits()).name
+            == name
+        )
+
+
 def test_too_few_tie_points_are_never_accepted_however_clear_the_rest() -> None:
     verdict = assess(replace(CLEAR, margin=20.0, null_ratio=20.0, held_out=3, held_out_agreeing=3), Limits())
     assert verdict.name == "doubtful"
