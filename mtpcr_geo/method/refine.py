@@ -131,7 +131,7 @@ def refine(
 def target_moves(source: Floats, target: Floats) -> bool:
     """Return whether the target is the smaller of two upright clouds, and moves in the source's stead.
 
-    Of two of one size it is the one that spreads less: exchanged, the same cloud moves.
+    Of two of one size it is the one that spreads less: exchanged or turned, the same cloud moves.
 
     Args:
         source, target: (n, 3) and (m, 3) work coordinates, metres.
@@ -139,7 +139,7 @@ def target_moves(source: Floats, target: Floats) -> bool:
     """
     if len(source) != len(target):
         return len(source) > len(target)
-    return tuple(source.std(axis=0)) > tuple(target.std(axis=0))
+    return float(source.var(axis=0).sum()) > float(target.var(axis=0).sum())
 
 
 def inverse_of(refinement: Refinement) -> Refinement:
