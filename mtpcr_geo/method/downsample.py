@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +15,9 @@ DENSE_VOXELS = 2.5
 """Mean points a voxel above which voxels give their mean point, and below which all points are taken."""
 
 AXES_POINTS = 200_000
+WHOLE_POINTS = 150_000
+REGION_VOXELS = 16.0
+"""Edge of the blocks of a cloud that are thinned as a whole, in voxels: points outside change none inside."""
 SHARES = 8
 """Shares of the points kept, from one to its double."""
 
@@ -80,46 +85,69 @@ def own_axes(xyz: Floats) -> Floats:
     return transforms.compose(axes, -axes @ middle)
 
 
-def thinned(
-    xyz: Floats, number: NDArray[np.int64], voxel: float, max_points: int, T_axes: Floats
-) -> tuple[Floats, Floats]:
-    """Thin points to at most `max_points`, in a way that depends only on the points and not on the frame.
+@dataclass(frozen=True)
+class Thinned:
+    """A thinned cloud.
 
-    Dense clouds give one mean point a voxel. Where voxels would hold hardly more than a point each, the
-    points are taken as they are, since another lattice of voxels would cut them otherwise. What is too many
-    is left out by a hash of the voxel, or of the point's number: if one comes or goes, the choice among all
-    others stays.
+    Attributes:
+        points: (m, 3) metres.
+        lots: (m,) from 0 to 1: points whose lots lie below a share are that share of them, spread evenly, and
+            stay the same where others come or go.
+
+    """
+
+    points: Floats
+    lots: Floats
+
+    def at_most(self, points: int, of: int) -> Thinned:
+        """Keep a share of the points, such that of a number of them at most as many as wanted are left.
+
+        Shares move by steps, so that a few points more or less change no choice.
+
+        Args:
+            points: wanted.
+            of: number of which they are to be.
+
+        """
+        if of <= points:
+            return self
+        share = 2.0 ** (np.floor(SHARES * np.log2(points / of)) / SHARES)
+        kept = self.lots < share
+        return Thinned(self.points[kept], self.lots[kept] / share)
+
+
+def thinned(xyz: Floats, around: Mask, voxel: float) -> Thinned:
+    """Thin the part of a cloud around some of its points, along the cloud's own axes, see `own_axes`.
+
+    So it does not matter how the cloud is turned, nor hardly which points these are exactly. Dense clouds
+    give one mean point a voxel. Where voxels would hold hardly more than a point each, the points are taken
+    as they are, since another lattice of voxels would cut them otherwise.
 
     Args:
         xyz: (n, 3) points, metres.
-        number: (n,) the points' numbers in their cloud.
+        around: (n,) marks points; of a large cloud what lies within `REGION_VOXELS` of them is thinned, of
+            others all.
         voxel: edge of a voxel, metres.
-        max_points: points at most.
-        T_axes: 4x4 to the frame in which voxels lie, see `own_axes`.
-
-    Returns:
-        (m, 3) metres, and for each point its lot, (m,) from 0 to 1: those below a share are that share of
-        the points, chosen as evenly and as lastingly as the points themselves.
 
     """
     import small_gicp
 
+    T_axes = own_axes(xyz)
     placed = transforms.apply(T_axes, xyz)
+    number = np.arange(len(xyz))
+    if len(xyz) > WHOLE_POINTS:
+        number = np.flatnonzero(near(placed, placed[around], REGION_VOXELS * voxel))
+        placed = placed[number]
     first = np.floor(transforms.bounds(placed)[0] / voxel) - 1
     corner = first * voxel + LATTICE_M
     placed -= corner
     thin = np.asarray(small_gicp.voxelgrid_sampling(placed, voxel, 1).points())[:, :3]
-    if len(xyz) < DENSE_VOXELS * len(thin):
+    if len(placed) < DENSE_VOXELS * len(thin):
         names, thin = number[:, None], placed
     else:
         names = (np.floor(thin / voxel) + first).astype(np.int64)
-    lots = _hash(names).astype(np.float64) * 2.0**-64
-    if len(thin) > max_points:
-        # the share moves by steps, so that a few points more or less in the overlap change no choice
-        share = 2.0 ** (np.floor(SHARES * np.log2(max_points / len(thin))) / SHARES)
-        kept = lots < share
-        thin, lots = thin[kept], lots[kept] / share
-    return transforms.apply(transforms.inverse(T_axes), thin + corner), lots
+    points = transforms.apply(transforms.inverse(T_axes), thin + corner)
+    return Thinned(points, _hash(names).astype(np.float64) * 2.0**-64)
 
 
 def _hash(names: NDArray[np.int64]) -> NDArray[np.uint64]:

@@ -26,7 +26,9 @@ NEAR_PER_EXTENT = 1 / 60
 FEWEST_CELLS = 12
 ROUNDS = 8
 FIT_ROUNDS = 10
-VOXELS_ACROSS, POINTS = 150.0, 20_000
+VOXELS_ACROSS, POINTS, MANY_POINTS = 150.0, 20_000, 60_000
+"""Voxels along the extent, and points of them that are looked at: few, and many where few show no floor.
+Among tall trees a scanner on the ground has most of its points on stems and crowns."""
 APART_DEG = 10.0
 """Floors that are no farther apart are one."""
 STILL_DEG = 0.02
@@ -62,6 +64,11 @@ class Floor:
     def quality(self) -> float:
         """Area over unevenness, times the share above it: what floors are ranked by."""
         return self.cells * self.above / (self.spread_m / self.extent_m + LEAST_UNEVEN)
+
+    @property
+    def even(self) -> bool:
+        """Whether it is a sheet at all: most lowest points lie near one plane."""
+        return self.spread_m <= self.extent_m * NEAR_PER_EXTENT
 
 
 def extent_of(xyz: Floats) -> float:
@@ -166,13 +173,21 @@ def floors_of(xyz: Floats, extent: float, rng: np.random.Generator) -> tuple[Flo
         rng: thins the points.
 
     """
-    few = one_per_voxel(xyz, extent / VOXELS_ACROSS, rng, POINTS)
-    axes = np.concatenate([np.eye(3), -np.eye(3)])[[2, 5, 0, 1, 3, 4]]
-    with ThreadPoolExecutor(usable_cores()) as threads:
-        floors = threads.map(lambda axis: floor_along(few, axis, extent), axes)
-        found = sorted(floors, key=lambda floor: -floor.quality)
+    thin = one_per_voxel(xyz, extent / VOXELS_ACROSS, rng, MANY_POINTS)
+    few = thin if len(thin) <= POINTS else thin[np.sort(rng.choice(len(thin), POINTS, replace=False))]
+    found = _floors(few, extent)
+    if len(thin) > POINTS and not found[0].even:
+        found = _floors(thin, extent)
     distinct: list[Floor] = []
     for floor in found:
         if all(angle_deg(floor.up, other.up) > APART_DEG for other in distinct):
             distinct.append(floor)
     return tuple(distinct)
+
+
+def _floors(thin: Floats, extent: float) -> list[Floor]:
+    """Find the floors of thinned points from both ends of each axis, best first."""
+    axes = np.concatenate([np.eye(3), -np.eye(3)])[[2, 5, 0, 1, 3, 4]]
+    with ThreadPoolExecutor(usable_cores()) as threads:
+        floors = threads.map(lambda axis: floor_along(thin, axis, extent), axes)
+        return sorted(floors, key=lambda floor: -floor.quality)

@@ -14,10 +14,9 @@ from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import IcpMethod, IcpRound
 from mtpcr_geo.core.wording import only
-from mtpcr_geo.method.downsample import near, own_axes, thinned
+from mtpcr_geo.method.downsample import near, thinned
 from mtpcr_geo.method.gicp import Descender, Surface, weighing
 from mtpcr_geo.method.neighbourhoods import local_shapes
-from mtpcr_geo.method.overlap import overlap_of
 
 FEWEST_POINTS = 60
 """Ten to each of the six parameters."""
@@ -125,20 +124,16 @@ class Surfaces:
     ) -> None:
         import small_gicp
 
+        farthest = max_correspondence_distance_m
         moved = transforms.apply(T_start, source)
-        overlap = overlap_of(moved, target)
-        of_source, of_target = (np.flatnonzero(overlap.select(xyz)) for xyz in (moved, target))
-        if min(len(of_source), len(of_target)) >= FEWEST_POINTS:
-            s, t = moved[of_source], target[of_target]
-            farthest = max_correspondence_distance_m
-            of_source, of_target = of_source[near(s, t, farthest)], of_target[near(t, s, farthest)]
-            del s, t
-        del moved, overlap  # copies of whole clouds
-        if min(len(of_source), len(of_target)) < FEWEST_POINTS:
-            role = "source" if len(of_source) <= len(of_target) else "target"
+        of_source, of_target = near(moved, target, farthest), near(target, moved, farthest)
+        del moved  # a copy of a whole cloud
+        fewest = min(of_source.sum(), of_target.sum())
+        if fewest < FEWEST_POINTS:
+            role = "source" if of_source.sum() == fewest else "target"
             raise RegistrationError(
-                f"{only(min(len(of_source), len(of_target)), 'point')} of the {role} lie in the "
-                f"overlap, within {max_correspondence_distance_m:g} m of the other cloud, and "
+                f"{only(int(fewest), 'point')} of the {role} lie in the "
+                f"overlap, within {farthest:g} m of the other cloud, and "
                 f"{FEWEST_POINTS} are needed to refine the pose: it brings hardly any of the clouds "
                 "together, or they are too sparse; give denser clouds, or leave the refinement out (method "
                 "none of mtpcr.refine in a pipeline)"
@@ -147,26 +142,27 @@ class Surfaces:
         self.voxel_m = voxel_m
         self._threads = threads or usable_cores()
         self._pivot = np.floor(transforms.centroid(target[of_target]))
-        # each cloud is thinned along its own axes: how either is turned, and a hair's breadth at the start,
-        # change no point
-        (s, lots), (t, _) = (
-            thinned(cloud[rows], rows, voxel_m, most, own_axes(cloud))
-            for cloud, rows, most in ((source, of_source, max_points), (target, of_target, 3 * max_points))
-        )
-        s = transforms.apply(T_start, s)
-        if min(len(s), len(t)) < FEWEST_THINNED:
+        thin_s, thin_t = thinned(source, of_source, voxel_m), thinned(target, of_target, voxel_m)
+        s = transforms.apply(T_start, thin_s.points)
+        shared = int(near(s, thin_t.points, farthest).sum()), int(near(thin_t.points, s, farthest).sum())
+        if min(shared) < FEWEST_THINNED:
             raise RegistrationError(
-                f"the overlap holds points in {only(min(len(s), len(t)), 'cell')} of {voxel_m:g} m only, and "
+                f"the overlap holds points in {only(min(shared), 'cell')} of {voxel_m:g} m only, and "
                 f"{FEWEST_THINNED} are needed to refine the pose: it brings hardly any of the clouds together"
             )
-        self._s, self._t, self._lots = s - self._pivot, t - self._pivot, lots
-        self._source, self._target = small_gicp.PointCloud(self._s), small_gicp.PointCloud(self._t)
+        thin_s, thin_t = thin_s.at_most(max_points, shared[0]), thin_t.at_most(3 * max_points, shared[1])
+        s = transforms.apply(T_start, thin_s.points)
+        # what lies farther away has no partner, but shows the surfaces at the edge of the overlap
+        self._kept = np.flatnonzero(near(s, thin_t.points, farthest))
+        self._around, self._t = s - self._pivot, thin_t.points - self._pivot
+        self._s, self._lots = self._around[self._kept], thin_s.lots[self._kept]
+        self._source, self._target = small_gicp.PointCloud(self._around), small_gicp.PointCloud(self._t)
         self._source_tree = self._with_surfaces(self._source)
         self._tree = self._with_surfaces(self._target)
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """Points kept of source and target."""
+        """Points kept of the source's overlap and of the target."""
         return len(self._s), len(self._t)
 
     def descend(
@@ -268,17 +264,17 @@ class Surfaces:
 
     @cached_property
     def _descender(self) -> Descender:
-        source, target = (
-            Surface(points, np.asarray(cloud.normals())[:, :3])
-            for points, cloud in ((self._s, self._source), (self._t, self._target))
-        )
-        return Descender(source, target, self._tree, self._lots)
+        of_source, of_target = (np.asarray(cloud.normals())[:, :3] for cloud in (self._source, self._target))
+        source = Surface(self._s, of_source[self._kept])
+        return Descender(source, Surface(self._t, of_target), self._tree, self._lots)
 
     @cached_property
     def _probes(self) -> tuple[Floats, Floats]:
         """Flat places of the source, (n, 3), and their unit normals, (n, 3)."""
         chosen = np.flatnonzero(self._lots * max(len(self._s) // PROBES, 1) < 1.0)
-        spread, axes = local_shapes(self._source_tree, self._s, self._s[chosen], NEIGHBOURS, self._threads)
+        spread, axes = local_shapes(
+            self._source_tree, self._around, self._s[chosen], NEIGHBOURS, self._threads
+        )
         flat = spread[:, 1] > FLAT * spread[:, 0]
         return self._s[chosen[flat]], axes[flat, :, 0]
 

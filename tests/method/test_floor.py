@@ -44,6 +44,28 @@ def test_the_floor_is_found_however_the_cloud_is_turned(turn: str, half: float) 
     assert best.share > 0.6
 
 
+def tall_stand(rng: np.random.Generator) -> np.ndarray:
+    """A plot scanned among trees higher than it is wide: one point in sixty lies on the ground."""
+    crowns = rng.normal(0, 1, (170_000, 3))
+    crowns *= [2.2, 2.2, 6.0] / np.linalg.norm(crowns, axis=1)[:, None]
+    foot = np.random.default_rng(7).uniform(-12.0, 12.0, (12, 2))
+    crowns += np.column_stack([foot, np.full(12, 24.0)])[rng.integers(0, 12, len(crowns))]
+    stems = np.column_stack([foot[rng.integers(0, 12, 8000)], rng.uniform(0.0, 20.0, 8000)])
+    stems[:, :2] += rng.normal(0.0, 0.15, (8000, 2))
+    ground = np.column_stack([rng.uniform(-13.0, 13.0, (3000, 2)), rng.normal(0.0, 0.03, 3000)])
+    return np.vstack([crowns, stems, ground])
+
+
+@pytest.mark.parametrize("tilt", [0.0, 3.0, 12.0, 30.0])
+def test_the_floor_is_found_where_hardly_any_points_lie_on_it(tilt: float) -> None:
+    R = transforms.tilt_matrix(0.7, np.radians(tilt)) @ transforms.yaw_matrix(0.4)
+    xyz = tall_stand(np.random.default_rng(5)) @ R.T
+    best = floors_of(xyz, extent_of(xyz), np.random.default_rng(0))[0]
+    assert angle_deg(best.up, R @ UP) < 1.0
+    assert best.even
+    assert evidence_of(xyz).upright == (tilt < 40.0)
+
+
 @pytest.mark.parametrize("turn", TURNS)
 def test_the_likeliest_vertical_is_right_at_any_turn(turn: str) -> None:
     R = TURNS[turn] @ transforms.yaw_matrix(-0.3)
