@@ -14,9 +14,8 @@ MAX_VOXELS = 30_000_000
 DENSE_VOXELS = 2.5
 """Mean points a voxel above which voxels give their mean point, and below which all points are taken."""
 
-AXES_POINTS = 200_000
-WHOLE_POINTS = 150_000
-REGION_VOXELS = 16.0
+AXES_POINTS = 50_000
+REGION_VOXELS = 8.0
 """Edge of the blocks of a cloud that are thinned as a whole, in voxels: points outside change none inside."""
 SHARES = 8
 """Shares of the points kept, from one to its double."""
@@ -125,8 +124,7 @@ def thinned(xyz: Floats, around: Mask, voxel: float) -> Thinned:
 
     Args:
         xyz: (n, 3) points, metres.
-        around: (n,) marks points; of a large cloud what lies within `REGION_VOXELS` of them is thinned, of
-            others all.
+        around: (n,) marks points; what lies within `REGION_VOXELS` of them is thinned.
         voxel: edge of a voxel, metres.
 
     """
@@ -134,10 +132,8 @@ def thinned(xyz: Floats, around: Mask, voxel: float) -> Thinned:
 
     T_axes = own_axes(xyz)
     placed = transforms.apply(T_axes, xyz)
-    number = np.arange(len(xyz))
-    if len(xyz) > WHOLE_POINTS:
-        number = np.flatnonzero(near(placed, placed[around], REGION_VOXELS * voxel))
-        placed = placed[number]
+    number = np.flatnonzero(near(placed, placed[around], REGION_VOXELS * voxel))
+    placed = placed[number]
     first = np.floor(transforms.bounds(placed)[0] / voxel) - 1
     corner = first * voxel + LATTICE_M
     placed -= corner

@@ -8,6 +8,7 @@ one order, whatever the number of threads, so that results are the same bits.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,8 @@ from mtpcr_geo.core.types import IcpMethod
 ALONG_NORMAL = 1e-3
 """Variance of a surface along its normal, as a share of that across it (the paper's epsilon)."""
 FEWEST_PARTNERS = 6
+LONGEST_RING = 8
+"""Steps after which a descent may be back where it was."""
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 """Multiples of this, less their whole part, spread evenly, however many there are."""
 _HAIR_M = 1e-9  # rounding could tip what is nearly halfway
@@ -175,6 +178,7 @@ class Descender:
             points, normals = points[few], normals[few]
             partners = Partners(self._tree, self.target.points, points, within_m)
         damping, inliers = DAMPING, 0
+        lately: deque[Floats] = deque(maxlen=LONGEST_RING)
         for number in range(1, iterations + 1):
             near, places, partner = partners.of(T)
             inliers = len(near)
@@ -197,6 +201,10 @@ class Descender:
             T = change @ T
             if np.linalg.norm(step[:3]) <= still_rad and np.linalg.norm(step[3:]) <= still_m:
                 return Descended(T, number, inliers, converged=True)
+            # points on the verge of another partner may send it round in a ring for ever
+            if any(_are_one(T, earlier, still_rad, still_m) for earlier in lately):
+                return Descended(T, number, inliers, converged=True)
+            lately.append(T)
         return Descended(T, iterations, inliers, converged=False)
 
 
@@ -288,6 +296,13 @@ def _cross(v: Floats) -> Floats:
 def _moved(T: Floats, places: Floats) -> Floats:
     """Move (3, n) points."""
     return np.asarray(np.einsum("ij,jn->in", T[:3, :3], places) + T[:3, 3:])
+
+
+def _are_one(A: Floats, B: Floats, still_rad: float, still_m: float) -> bool:
+    """Return whether two 4x4 differ by no more than what counts as standing still."""
+    if np.linalg.norm(A[:3, 3] - B[:3, 3]) > still_m:
+        return False
+    return bool(np.linalg.norm(A[:3, :3] - B[:3, :3]) <= np.sqrt(2.0) * still_rad)
 
 
 def _exponential(step: Floats) -> Floats:

@@ -147,3 +147,22 @@ def test_the_weights_are_the_inverse_of_both_covariances():
     H, b = weights.equations(places, gap)
     np.testing.assert_allclose(H, np.einsum("nik,nij,njl->kl", J, information, J), rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(b, np.einsum("nik,nij,jn->k", J, information, gap), rtol=1e-9, atol=1e-6)
+
+
+@pytest.mark.parametrize(("seed", "within"), [(2, 1.0), (5, 0.5), (10, 0.5)])
+def test_a_descent_that_goes_round_in_a_ring_ends(seed, within):
+    # a point on the verge of another partner takes it with one step and leaves it with the next
+    _, tree, target = cloud_of(surface(seed, 3000))
+    moved = transforms.apply(small_motion(seed, 0.2, 0.3), surface(seed + 100, 3000))
+    descender = Descender(cloud_of(moved)[2], target, tree)
+    found = descender.descend(
+        np.eye(4), within_m=within, method="gicp", iterations=300, still_rad=4e-6, still_m=1e-4
+    )
+    assert found.converged
+    assert found.iterations < 50
+    again = descender.descend(
+        found.T, within_m=within, method="gicp", iterations=300, still_rad=4e-6, still_m=1e-4
+    )
+    degrees, metres = apart(again.T, found.T)
+    assert metres < 0.001
+    assert degrees < 0.001
