@@ -1,4 +1,4 @@
-"""Thinning of points by voxels, in ways that depend only on the points and not on the frame they stand in."""
+"""Thinning of points by voxels."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ MAX_VOXELS = 30_000_000
 DENSE_VOXELS = 2.5
 """Mean points a voxel above which voxels give their mean point, and below which all points are taken."""
 
-AXES_POINTS = 50_000
+AXES_POINTS = 2_000_000
+"""Points above which axes are those of every second, third ... one."""
 REGION_VOXELS = 8.0
-"""Edge of the blocks of a cloud that are thinned as a whole, in voxels: points outside change none inside."""
+"""Edge of the blocks of a cloud that are thinned as a whole, in voxels."""
 SHARES = 8
-"""Shares of the points kept, from one to its double."""
+"""Steps of the share of the points kept, from one share to its double."""
 
 _BLOCK = 131_072
 
 LATTICE_M = 0.00037
-"""Shift of the voxels off whole millimetres, on which points of a LAS scale lie."""
+"""Shift of the voxels off the axes, on which points of an exact grid lie."""
 
 
 def near(points: Floats, others: Floats, distance: float) -> Mask:
     """Return which points may have one of the others within a distance.
 
     Args:
-        points: (n, 3) metres.
-        others: (m, 3) metres.
+        points: (n, 3) metres; n > 0.
+        others: (m, 3) metres; m > 0.
         distance: metres; voxels of at least this edge are compared, so a little farther ones pass too.
 
     Returns:
@@ -39,34 +40,55 @@ def near(points: Floats, others: Floats, distance: float) -> Mask:
 
     """
     (low_p, high_p), (low_o, high_o) = transforms.bounds(points), transforms.bounds(others)
-    span = np.maximum(high_p, high_o) - np.minimum(low_p, low_o)
-    edge = max(distance, float(np.cbrt(np.prod(span + 4 * distance) / MAX_VOXELS)))
-    low = np.minimum(low_p, low_o) - 2 * edge
-    shape = np.floor(span / edge).astype(int) + 5
+    low, high = np.maximum(low_p, low_o) - distance, np.minimum(high_p, high_o) + distance
+    found = np.zeros(len(points), bool)
+    if (low > high).any():
+        return found
+    edge = _edge_of(low, high, distance)
+    # voxels stand where they stand whatever the bounds are
+    first = np.floor(low / edge).astype(np.int64) - 1
+    shape = np.floor(high / edge).astype(np.int64) - first + 2
     filled = np.zeros(tuple(shape.tolist()), dtype=np.bool_)
     for start in range(0, len(others), _BLOCK):
-        filled[_voxels(others[start : start + _BLOCK], low, edge)] = True
+        some = others[start : start + _BLOCK]
+        filled[_voxels(some[_within(some, low, high)], first, edge)] = True
     for axis in range(3):
         # voxels beside a filled one along each axis in turn: all 26 neighbours in the end
         ahead, behind = np.roll(filled, 1, axis), np.roll(filled, -1, axis)
         filled = filled | ahead | behind
-    found = np.empty(len(points), bool)
     for start in range(0, len(points), _BLOCK):
-        part = slice(start, start + _BLOCK)
-        found[part] = filled[_voxels(points[part], low, edge)]
+        some = points[start : start + _BLOCK]
+        inside = np.flatnonzero(_within(some, low, high))
+        found[start + inside] = filled[_voxels(some[inside], first, edge)]
     return found
 
 
-def _voxels(xyz: Floats, low: Floats, edge: float) -> tuple[NDArray[np.int64], ...]:
-    return tuple(np.floor((xyz - low) / edge).astype(np.int64).T)
+def _edge_of(low: Floats, high: Floats, least: float) -> float:
+    """Return the edge of voxels between two corners, of which there are at most `MAX_VOXELS`."""
+    edge = least
+    while np.prod(np.floor((high - low) / edge) + 5.0) > MAX_VOXELS:
+        edge *= 1.2
+    return edge
+
+
+def _within(xyz: Floats, low: Floats, high: Floats) -> Mask:
+    """Mark (n, 3) points between two corners."""
+    inside = np.ones(len(xyz), bool)
+    for axis in range(3):
+        inside &= (xyz[:, axis] >= low[axis]) & (xyz[:, axis] <= high[axis])
+    return inside
+
+
+def _voxels(xyz: Floats, first: NDArray[np.int64], edge: float) -> tuple[NDArray[np.int64], ...]:
+    return tuple((np.floor(xyz / edge).astype(np.int64) - first).T)
 
 
 def own_axes(xyz: Floats) -> Floats:
     """Return the frame of a cloud's own principal axes, which goes along wherever the cloud is moved.
 
     The origin is the centroid. Axes run along greatest, middle and least spread, the first two to the side
-    on which the points reach farther (third moments). Of points that spread alike in all directions the axes
-    are arbitrary. Of many points every so many are looked at.
+    on which the points reach farther (third moments). Of points that spread alike in two directions, such as
+    those of a square or round plot, the axes hang on single points.
 
     Args:
         xyz: (n, 3) points, metres; n > 0.
@@ -77,9 +99,14 @@ def own_axes(xyz: Floats) -> Floats:
     """
     some = xyz[:: -(-len(xyz) // AXES_POINTS)]
     middle = transforms.centroid(some)
-    some = some - middle
-    axes = np.linalg.eigh(some.T @ some)[1][:, ::-1].T
-    axes[((some @ axes.T) ** 3).sum(axis=0) < 0.0] *= -1.0
+    scatter, reach = np.zeros((3, 3)), np.zeros(3)
+    for start in range(0, len(some), _BLOCK):
+        part = some[start : start + _BLOCK] - middle
+        scatter += part.T @ part
+    axes = np.linalg.eigh(scatter)[1][:, ::-1].T
+    for start in range(0, len(some), _BLOCK):
+        reach += (((some[start : start + _BLOCK] - middle) @ axes.T) ** 3).sum(axis=0)
+    axes[reach < 0.0] *= -1.0
     axes[2] = np.cross(axes[0], axes[1])
     return transforms.compose(axes, -axes @ middle)
 
@@ -90,22 +117,23 @@ class Thinned:
 
     Attributes:
         points: (m, 3) metres.
-        lots: (m,) from 0 to 1: points whose lots lie below a share are that share of them, spread evenly, and
-            stay the same where others come or go.
+        lots: (m,) from 0 to 1, by chance: points whose lots lie below a share are about that share of them.
+            A point keeps its lot where others come or go, as long as the lattice stays.
 
     """
 
     points: Floats
     lots: Floats
 
-    def at_most(self, points: int, of: int) -> Thinned:
-        """Keep a share of the points, such that of a number of them at most as many as wanted are left.
+    def reduced(self, points: int, of: int) -> Thinned:
+        """Keep a share of the points, such that of a number of them about as many as wanted stay, or less.
 
-        Shares move by steps, so that a few points more or less change no choice.
+        Shares are powers of the eighth root of a half, so that a few points more or less mostly change no
+        choice.
 
         Args:
-            points: wanted.
-            of: number of which they are to be.
+            points: wanted, to within the square root of that.
+            of: number of points that they are to be the rest of.
 
         """
         if of <= points:
@@ -118,22 +146,27 @@ class Thinned:
 def thinned(xyz: Floats, around: Mask, voxel: float) -> Thinned:
     """Thin the part of a cloud around some of its points, along the cloud's own axes, see `own_axes`.
 
-    So it does not matter how the cloud is turned, nor hardly which points these are exactly. Dense clouds
-    give one mean point a voxel. Where voxels would hold hardly more than a point each, the points are taken
-    as they are, since another lattice of voxels would cut them otherwise.
+    It does not matter how the cloud is turned, and little which points at the edge are among them. Dense
+    clouds give one mean point a voxel. Where voxels would hold hardly more than a point each, the points are
+    taken as they are, since another lattice of voxels would cut them otherwise.
 
     Args:
         xyz: (n, 3) points, metres.
-        around: (n,) marks points; what lies within `REGION_VOXELS` of them is thinned.
+        around: (n,) marks points, one at least; blocks of `REGION_VOXELS` that hold one, and those beside
+            them, are thinned.
         voxel: edge of a voxel, metres.
 
     """
     import small_gicp
 
     T_axes = own_axes(xyz)
-    placed = transforms.apply(T_axes, xyz)
-    number = np.flatnonzero(near(placed, placed[around], REGION_VOXELS * voxel))
-    placed = placed[number]
+    block = REGION_VOXELS * voxel
+    low, high = transforms.bounds(xyz[around])
+    far = 2.0 * np.sqrt(3.0) * block
+    number = np.flatnonzero(_within(xyz, low - far, high + far))
+    placed = transforms.apply(T_axes, xyz[number])
+    beside = near(placed, placed[around[number]], block)
+    number, placed = number[beside], placed[beside]
     first = np.floor(transforms.bounds(placed)[0] / voxel) - 1
     corner = first * voxel + LATTICE_M
     placed -= corner
@@ -152,6 +185,10 @@ def _hash(names: NDArray[np.int64]) -> NDArray[np.uint64]:
     for column in names.T.astype(np.uint64):
         key = (key ^ column) * np.uint64(0x9E3779B97F4A7C15)
         key ^= key >> np.uint64(29)
+    # names that run on, times a constant, are spread evenly and not by chance: mixed twice more
+    for constant, shift in ((0xBF58476D1CE4E5B9, 27), (0x94D049BB133111EB, 31)):
+        key *= np.uint64(constant)
+        key ^= key >> np.uint64(shift)
     return key
 
 

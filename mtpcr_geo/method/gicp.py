@@ -22,7 +22,7 @@ ALONG_NORMAL = 1e-3
 """Variance of a surface along its normal, as a share of that across it (the paper's epsilon)."""
 FEWEST_PARTNERS = 6
 LONGEST_RING = 8
-"""Steps after which a descent may be back where it was."""
+"""Steps, at most, after which a descent that is back where it was has ended."""
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 """Multiples of this, less their whole part, spread evenly, however many there are."""
 _HAIR_M = 1e-9  # rounding could tip what is nearly halfway
@@ -53,7 +53,7 @@ class Descended:
         T: 4x4 from source to target.
         iterations: how many there were.
         inliers: points with a partner at its end.
-        converged: whether it stands still.
+        converged: whether it stands still, or goes round in a ring of a few steps.
 
     """
 
@@ -157,7 +157,7 @@ class Descender:
         among: Indices | None = None,
         enough: int | None = None,
     ) -> Descended:
-        """Iterate from a transform until it stands still.
+        """Iterate from a transform until it stands still, or goes round in a ring: its mean is returned then.
 
         Args:
             T: 4x4 from source to target.
@@ -178,7 +178,7 @@ class Descender:
             points, normals = points[few], normals[few]
             partners = Partners(self._tree, self.target.points, points, within_m)
         damping, inliers = DAMPING, 0
-        lately: deque[Floats] = deque(maxlen=LONGEST_RING)
+        lately: deque[Floats] = deque([T], maxlen=LONGEST_RING + 1)
         for number in range(1, iterations + 1):
             near, places, partner = partners.of(T)
             inliers = len(near)
@@ -202,9 +202,10 @@ class Descender:
             if np.linalg.norm(step[:3]) <= still_rad and np.linalg.norm(step[3:]) <= still_m:
                 return Descended(T, number, inliers, converged=True)
             # points on the verge of another partner may send it round in a ring for ever
-            if any(_are_one(T, earlier, still_rad, still_m) for earlier in lately):
-                return Descended(T, number, inliers, converged=True)
             lately.append(T)
+            for back in range(2, len(lately)):
+                if _are_one(T, lately[-1 - back], still_rad, still_m):
+                    return Descended(_mean(list(lately)[-back:]), number, inliers, converged=True)
         return Descended(T, iterations, inliers, converged=False)
 
 
@@ -303,6 +304,13 @@ def _are_one(A: Floats, B: Floats, still_rad: float, still_m: float) -> bool:
     if np.linalg.norm(A[:3, 3] - B[:3, 3]) > still_m:
         return False
     return bool(np.linalg.norm(A[:3, :3] - B[:3, :3]) <= np.sqrt(2.0) * still_rad)
+
+
+def _mean(ring: list[Floats]) -> Floats:
+    """Return the mean of some 4x4 that hardly differ: the same wherever in the ring one begins."""
+    T = np.mean(ring, axis=0)
+    T[:3, :3] = transforms.orthonormal(T[:3, :3])
+    return np.asarray(T, np.float64)
 
 
 def _exponential(step: Floats) -> Floats:

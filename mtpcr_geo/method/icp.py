@@ -96,15 +96,16 @@ class Correspondences:
 
 
 class Surfaces:
-    """Both clouds' points in their overlap, thinned, with the directions of their surfaces.
+    """Both clouds' points in and around their overlap, thinned, with the directions of their surfaces.
 
     Args:
         source, target: (n, 3) and (m, 3) work coordinates, metres.
         T_start: 4x4 from source to target, near the result: it decides which points lie in the overlap.
         voxel_m: thinning, metres.
         max_correspondence_distance_m: farthest correspondence to be asked for, metres.
-        max_points: of the source after thinning; the target, which costs less, may have three times as many.
-        threads: for thinning and surfaces; all cores if None. Results do not depend on it.
+        max_points: of the source after thinning, about; the target, which costs less, may have three times as
+            many in what both share, and has its surroundings besides.
+        threads: for surfaces; all cores if None. Results do not depend on it.
 
     Raises:
         RegistrationError: if the clouds hardly overlap under the start.
@@ -144,16 +145,18 @@ class Surfaces:
         self._pivot = np.floor(transforms.centroid(target[of_target]))
         thin_s, thin_t = thinned(source, of_source, voxel_m), thinned(target, of_target, voxel_m)
         s = transforms.apply(T_start, thin_s.points)
-        shared = int(near(s, thin_t.points, farthest).sum()), int(near(thin_t.points, s, farthest).sum())
-        if min(shared) < FEWEST_THINNED:
-            raise RegistrationError(
-                f"the overlap holds points in {only(min(shared), 'cell')} of {voxel_m:g} m only, and "
-                f"{FEWEST_THINNED} are needed to refine the pose: it brings hardly any of the clouds together"
-            )
-        thin_s, thin_t = thin_s.at_most(max_points, shared[0]), thin_t.at_most(3 * max_points, shared[1])
+        shared = near(s, thin_t.points, farthest).sum(), near(thin_t.points, s, farthest).sum()
+        thin_s = thin_s.reduced(max_points, int(shared[0]))
+        thin_t = thin_t.reduced(3 * max_points, int(shared[1]))
         s = transforms.apply(T_start, thin_s.points)
         # what lies farther away has no partner, but shows the surfaces at the edge of the overlap
         self._kept = np.flatnonzero(near(s, thin_t.points, farthest))
+        fewest = min(len(self._kept), int(near(thin_t.points, s, farthest).sum()))
+        if fewest < FEWEST_THINNED:
+            raise RegistrationError(
+                f"the overlap holds points in {only(fewest, 'cell')} of {voxel_m:g} m only, and "
+                f"{FEWEST_THINNED} are needed to refine the pose: it brings hardly any of the clouds together"
+            )
         self._around, self._t = s - self._pivot, thin_t.points - self._pivot
         self._s, self._lots = self._around[self._kept], thin_s.lots[self._kept]
         self._source, self._target = small_gicp.PointCloud(self._around), small_gicp.PointCloud(self._t)
@@ -162,7 +165,7 @@ class Surfaces:
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """Points kept of the source's overlap and of the target."""
+        """Points of the source that have some of the target near by, and all points of the target."""
         return len(self._s), len(self._t)
 
     def descend(

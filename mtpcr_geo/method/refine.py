@@ -58,7 +58,7 @@ class RefineSettings:
         voxel_m: thinning of the points, metres.
         max_correspondence_distances_m: farthest correspondence of each round, metres; if None, far and near
             rounds are tried, and what the surfaces fit best is taken.
-        max_points: points of the source after thinning; the target may have three times as many.
+        max_points: points of the source after thinning, about; the target may have three times as many.
         iterations: iterations of each round at most.
         motion: degrees of freedom of the result: all six, yaw and shift, or the shift alone.
         ground: settle height and tilt on the ground before ICP, and the height after it.
@@ -131,7 +131,8 @@ def refine(
 def target_moves(source: Floats, target: Floats) -> bool:
     """Return whether the target is the smaller of two upright clouds, and moves in the source's stead.
 
-    Of two of one size it is the one that spreads less: exchanged or turned, the same cloud moves.
+    Of two of one size it is the one that spreads less: exchanged or turned, the same cloud moves, unless they
+    spread alike.
 
     Args:
         source, target: (n, 3) and (m, 3) work coordinates, metres.

@@ -160,7 +160,10 @@ def _ground_shape(evidence: Evidence, limits: Limits) -> Check:
         return Check("ground shape", "too little ground", "its relief followed", None, meaning)
     most = max(limits.ground_shape * relief, FLAT_GROUND_M)
     if may_repeat(evidence.repeats, evidence.self_likeness) and evidence.ground_noise_m is not None:
-        meaning += " Where the scene repeats itself, or may, it must agree to a multiple of its noise."
+        meaning += (
+            " Where the scene repeats itself, or may, it must agree to a multiple of its noise: a smaller "
+            "one where few tie points agree."
+        )
         most = min(most, noise_of_rows(evidence, limits) * max(evidence.ground_noise_m, LEAST_GROUND_NOISE_M))
     value, wanted = beside(spread, most, 2)
     return Check("ground shape", f"{value} m, relief {relief:.2f} m", f"at most {wanted} m", True, meaning)

@@ -12,6 +12,10 @@ from mtpcr_geo.verdict.probability import may_repeat, rows_over_noise
 
 FEWEST_GROUND_CELLS = 30
 FEWEST_HELD_OUT = 4
+AGREE_AMONG_ROWS, LEAST_AGREE = 0.6, 0.25
+"""Share of the held-out tie points below which the ground among rows must agree the better, and the share
+below which it need not agree better still. Of 193 right poses among rows 0.52 and more agree, but for one
+whose ground fits; a vineyard without its right place that was accepted had 0.35."""
 FLAT_GROUND_M = 0.15
 """Spread of the height differences below which they are noise, and say nothing of the ground's shape."""
 LITTLE_SHARED = 0.2
@@ -85,10 +89,6 @@ def _for_more_evidence(evidence: Evidence) -> str:
     return _OTHER_PLACES
 
 
-MOST_AGREE = 0.6
-"""Share of the held-out tie points that agree, below which the ground among rows must agree the better. Under
-right poses among rows it is 0.52 at least, but for one in 193, and there the ground fits; a vineyard without
-its right place that was accepted had 0.35."""
 _LOOK = "look in the report whether outlines lie on each other"
 
 
@@ -270,11 +270,9 @@ def terrain_of_rows_finding(evidence: Evidence, limits: Limits) -> CheckFinding 
         return None
     does = "repeats" if evidence.repeats else "may repeat"
     value, wanted = beside(ratio, most)
-    few = (
-        ""
-        if most == limits.ground_noise_of_rows
-        else f", since so few of the tie points agree ({_few(evidence)})"
-    )
+    few = ""
+    if most < limits.ground_noise_of_rows:
+        few = f", since only {evidence.held_out_agreeing} of {evidence.held_out} tie points agree"
     return CheckFinding(
         f"the scene {does} itself, and the ground beneath it differs by {evidence.ground_spread_m:.2f} m, "
         f"{value} times what its noise explains (wanted at most {wanted}{few}): other "
@@ -283,17 +281,18 @@ def terrain_of_rows_finding(evidence: Evidence, limits: Limits) -> CheckFinding 
 
 
 def noise_of_rows(evidence: Evidence, limits: Limits) -> float:
-    """Return the most spread of the ground among rows, as a multiple of its noise.
+    """Return the most spread of the ground among rows to accept, as a multiple of its noise.
 
-    Where a minority of the tie points agrees, trees or panels that differ from row to row do not bear the
-    place out, and the terrain must do so the more.
+    Where the default search finds less than `AGREE_AMONG_ROWS` of the tie points to agree, what differs from
+    row to row, such as missing trees, does not bear the place out, and the terrain must do so the more. Other
+    matchers' tie points agree by a minority in any scene.
     """
-    agree = evidence.held_out_agreeing / max(evidence.held_out, 1)
-    return limits.ground_noise_of_rows * min(1.0, agree / MOST_AGREE)
-
-
-def _few(evidence: Evidence) -> str:
-    return f"{evidence.held_out_agreeing} of {evidence.held_out}"
+    if evidence.null_ratio is None or evidence.held_out < FEWEST_HELD_OUT:
+        return limits.ground_noise_of_rows
+    agree = evidence.held_out_agreeing / evidence.held_out
+    if agree >= AGREE_AMONG_ROWS:
+        return limits.ground_noise_of_rows
+    return limits.ground_noise_of_rows * max(agree, LEAST_AGREE) / AGREE_AMONG_ROWS
 
 
 def objects_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:

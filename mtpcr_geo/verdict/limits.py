@@ -120,7 +120,7 @@ class Limits:
         ground_noise_of_rows: where the scene repeats itself, most spread of the height differences between
             both grounds, as a multiple of their noise, to accept: under 46 right poses of simulated rows it
             is 3 to 11, under 50 wrong ones 14 and more but for three. Less, in proportion, where fewer than
-            `mtpcr_geo.verdict.findings.MOST_AGREE` of the tie points agree.
+            `mtpcr_geo.verdict.findings.AGREE_AMONG_ROWS` of the tie points agree.
         objects_missing: greatest share of objects missing in the other cloud to accept.
 
     """

