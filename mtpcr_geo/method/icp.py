@@ -103,7 +103,7 @@ class Surfaces:
         T_start: 4x4 from source to target, near the result: it decides which points lie in the overlap.
         voxel_m: thinning, metres.
         max_correspondence_distance_m: farthest correspondence to be asked for, metres.
-        max_points: of the source after thinning, about; the target, which costs less, may have three times as
+        max_points: of the source after thinning, about; the target, which costs less, may have twice as
             many in what both share, and has its surroundings besides.
         threads: for surfaces; all cores if None. Results do not depend on it.
 
@@ -120,7 +120,7 @@ class Surfaces:
         *,
         voxel_m: float = 0.5,
         max_correspondence_distance_m: float = FAR_DISTANCES_M[0],
-        max_points: int = 30_000,
+        max_points: int = 60_000,
         threads: int | None = None,
     ) -> None:
         import small_gicp
@@ -147,7 +147,7 @@ class Surfaces:
         s = transforms.apply(T_start, thin_s.points)
         shared = near(s, thin_t.points, farthest).sum(), near(thin_t.points, s, farthest).sum()
         thin_s = thin_s.reduced(max_points, int(shared[0]))
-        thin_t = thin_t.reduced(3 * max_points, int(shared[1]))
+        thin_t = thin_t.reduced(2 * max_points, int(shared[1]))
         s = transforms.apply(T_start, thin_s.points)
         # what lies farther away has no partner, but shows the surfaces at the edge of the overlap
         self._kept = np.flatnonzero(near(s, thin_t.points, farthest))

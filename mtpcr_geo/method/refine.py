@@ -28,7 +28,6 @@ FINEST_VOXEL_M = 0.2
 FINE_BELOW = 0.75
 """Share of the thinning before below which a last, finer round is worth its time."""
 FINE_DISTANCE_VOXELS = 2.0
-FINE_POINTS = 2
 FINE_SLACK = 5.0
 """Times the usual step below which the fine round stands still: its many points trade partners for ever."""
 SAME_FIT = 1.02
@@ -58,7 +57,7 @@ class RefineSettings:
         voxel_m: thinning of the points, metres.
         max_correspondence_distances_m: farthest correspondence of each round, metres; if None, far and near
             rounds are tried, and what the surfaces fit best is taken.
-        max_points: points of the source after thinning, about; the target may have three times as many.
+        max_points: points of the source after thinning, about; the target may have twice as many.
         iterations: iterations of each round at most.
         motion: degrees of freedom of the result: all six, yaw and shift, or the shift alone.
         ground: settle height and tilt on the ground before ICP, and the height after it.
@@ -71,7 +70,7 @@ class RefineSettings:
     method: IcpMethod | None = "gicp"
     voxel_m: float = 0.5
     max_correspondence_distances_m: tuple[float, ...] | None = None
-    max_points: int = 30_000
+    max_points: int = 60_000
     iterations: int = 30
     motion: Motion = "rigid"
     ground: bool = True
@@ -252,7 +251,7 @@ def _refined_finely(
             T_start,
             voxel_m=voxel,
             max_correspondence_distance_m=distance,
-            max_points=FINE_POINTS * settings.max_points,
+            max_points=settings.max_points,
         )
     except RegistrationError:
         return None  # too few points lie so near each other: the rounds before stand

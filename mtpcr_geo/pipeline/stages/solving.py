@@ -148,7 +148,7 @@ class RefineOptions(StageOptions):
         "tried, and what the surfaces fit best is taken",
     )
     max_points: int = Field(
-        30_000,
+        60_000,
         ge=200,
         description="points of the source after thinning; the target may have three times as many",
     )
