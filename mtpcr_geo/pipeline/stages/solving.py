@@ -150,7 +150,7 @@ class RefineOptions(StageOptions):
     max_points: int = Field(
         60_000,
         ge=200,
-        description="points of the source after thinning; the target may have three times as many",
+        description="points of the source after thinning, about; the target may have twice as many",
     )
     iterations: int = Field(
         30, ge=1, description="iterations of a round at most; four times as many of the last"
