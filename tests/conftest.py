@@ -73,14 +73,13 @@ def hears() -> Iterator[tuple[str, list[Any]]]:
 @pytest.fixture(scope="session")
 def town_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Two small LAZ files of one made-up town: the source, turned and shifted, and the target."""
-    from helpers_scene import ORIGIN, town
+    from helpers_scene import ORIGIN, TOWN_TURNED, town
 
     rng = np.random.default_rng(7)
     folder = tmp_path_factory.mktemp("town")
     target = town(rng, 60_000) + ORIGIN
     source = town(rng, 40_000)
-    turn = transforms.compose(transforms.yaw_matrix(np.deg2rad(-61.0)), np.array([14.0, -9.0, 2.5]))
-    source = transforms.apply(turn, source[source[:, 0] > -30.0]) + ORIGIN
+    source = transforms.apply(TOWN_TURNED, source[source[:, 0] > -30.0]) + ORIGIN
     files = []
     for name, xyz in (("source", source), ("target", target)):
         extra: dict[str, NDArray[np.generic]] = {

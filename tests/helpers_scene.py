@@ -41,6 +41,8 @@ ICP_RESULT = IcpResult(
     rotated_deg=0.1,
 )
 ORIGIN = np.array([367_000.0, 5_820_000.0, 30.0])
+TOWN_TURNED = transforms.compose(transforms.yaw_matrix(np.deg2rad(-61.0)), np.array([14.0, -9.0, 2.5]))
+"""How the source of the fixture town_files was moved, about `ORIGIN`."""
 YAW = np.deg2rad(33.0)
 SHIFT = np.array([12.5, -7.25, 1.5])
 
