@@ -154,8 +154,8 @@ def test_every_crs_with_every_other(
     other_grid = {"UTM zone 31", "geographic", "Lambert-93"}
     within = 0.1 if "local" in (source, target) and {source, target} & other_grid else 0.001
     if target == "Europe's Lambert":
-        # metres 3.4 % too short: correspondences of so many metres take in other points (1.04 mm)
-        within = 0.0015
+        # metres 3.4 % too short: correspondences of so many metres take in other points (2.4 mm)
+        within = 0.003
     assert np.abs(placed(found.pair, group[source], group[target]) - metric_full).max() < within
 
 
