@@ -105,7 +105,8 @@ def own_axes(xyz: Floats) -> Floats:
         scatter += part.T @ part
     axes = np.linalg.eigh(scatter)[1][:, ::-1].T
     for start in range(0, len(some), _BLOCK):
-        reach += (((some[start : start + _BLOCK] - middle) @ axes.T) ** 3).sum(axis=0)
+        placed = axes @ (some[start : start + _BLOCK] - middle).T
+        reach += np.einsum("ij,ij,ij->i", placed, placed, placed)
     axes[reach < 0.0] *= -1.0
     axes[2] = np.cross(axes[0], axes[1])
     return transforms.compose(axes, -axes @ middle)
@@ -143,7 +144,7 @@ class Thinned:
         return Thinned(self.points[kept], self.lots[kept] / share)
 
 
-def thinned(xyz: Floats, around: Mask, voxel: float) -> Thinned:
+def thinned(xyz: Floats, around: Mask, voxel: float, T_axes: Floats | None = None) -> Thinned:
     """Thin the part of a cloud around some of its points, along the cloud's own axes, see `own_axes`.
 
     It does not matter how the cloud is turned, and little which points at the edge are among them. Dense
@@ -155,11 +156,12 @@ def thinned(xyz: Floats, around: Mask, voxel: float) -> Thinned:
         around: (n,) marks points, one at least; blocks of `REGION_VOXELS` that hold one, and those beside
             them, are thinned.
         voxel: edge of a voxel, metres.
+        T_axes: 4x4, the cloud's own axes where they are known already.
 
     """
     import small_gicp
 
-    T_axes = own_axes(xyz)
+    T_axes = own_axes(xyz) if T_axes is None else T_axes
     block = REGION_VOXELS * voxel
     low, high = transforms.bounds(xyz[around])
     far = 2.0 * np.sqrt(3.0) * block

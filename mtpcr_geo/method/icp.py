@@ -106,6 +106,8 @@ class Surfaces:
         max_points: of the source after thinning, about; the target, which costs less, may have twice as
             many in what both share, and has its surroundings besides.
         threads: for surfaces; all cores if None. Results do not depend on it.
+        T_axes: 4x4, own axes of source and target (`mtpcr_geo.method.downsample.own_axes`) where they are
+            known already.
 
     Raises:
         RegistrationError: if the clouds hardly overlap under the start.
@@ -122,6 +124,7 @@ class Surfaces:
         max_correspondence_distance_m: float = FAR_DISTANCES_M[0],
         max_points: int = 60_000,
         threads: int | None = None,
+        T_axes: tuple[Floats | None, Floats | None] = (None, None),
     ) -> None:
         import small_gicp
 
@@ -143,7 +146,8 @@ class Surfaces:
         self.voxel_m = voxel_m
         self._threads = threads or usable_cores()
         self._pivot = np.floor(transforms.centroid(target[of_target]))
-        thin_s, thin_t = thinned(source, of_source, voxel_m), thinned(target, of_target, voxel_m)
+        thin_s = thinned(source, of_source, voxel_m, T_axes[0])
+        thin_t = thinned(target, of_target, voxel_m, T_axes[1])
         s = transforms.apply(T_start, thin_s.points)
         shared = near(s, thin_t.points, farthest).sum(), near(thin_t.points, s, farthest).sum()
         thin_s = thin_s.reduced(max_points, int(shared[0]))

@@ -14,6 +14,7 @@ from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import IcpMethod, IcpResult, IcpRound, IcpTrial, Refinement
+from mtpcr_geo.method.downsample import own_axes
 from mtpcr_geo.method.icp import Descent, Rounds, Surfaces, rounds_for
 from mtpcr_geo.method.jackknife import equations_of_surfaces
 from mtpcr_geo.method.overlap import overlap_of
@@ -177,12 +178,14 @@ def _refine(
     surfaces: Surfaces | None = None
     starts = {"tie_points": T}
     ground_cell = ground_cell_for(cell)
+    axes: tuple[Floats | None, Floats | None] = (None, None)
     if settings.ground:
         ground_before = settle_on_ground(source, target, T, tilt=True, cell=ground_cell)
         T = starts["ground"] = ground_before.T
     if settings.method is not None:
         asked = settings.max_correspondence_distances_m
         rounds = {"asked": Rounds(tuple(asked))} if asked else rounds_for(cell)
+        axes = own_axes(source), own_axes(target)
         surfaces = Surfaces(
             source,
             target,
@@ -192,6 +195,7 @@ def _refine(
                 max(one.max_correspondence_distances_m) for one in rounds.values()
             ),
             max_points=settings.max_points,
+            T_axes=axes,
         )
         icp = follow_icp(
             surfaces,
@@ -203,7 +207,7 @@ def _refine(
             iterations=settings.iterations,
         )
         T = icp.T
-        fine = _refined_finely(source, target, T, settings, agreeing) if icp.followed else None
+        fine = _refined_finely(source, target, T, settings, agreeing, axes) if icp.followed else None
         if fine is not None:
             icp = replace(icp, T=fine.T, fine=fine.round_, fine_voxel_m=fine.surfaces.voxel_m)
             T, surfaces = fine.T, fine.surfaces
@@ -235,6 +239,7 @@ def _refined_finely(
     T_start: Floats,
     settings: RefineSettings,
     agreeing: Callable[[Floats], int],
+    T_axes: tuple[Floats | None, Floats | None],
 ) -> _Fine | None:
     """Run a last round of ICP as fine as the density allows; None where that brings nothing.
 
@@ -252,6 +257,7 @@ def _refined_finely(
             voxel_m=voxel,
             max_correspondence_distance_m=distance,
             max_points=settings.max_points,
+            T_axes=T_axes,
         )
     except RegistrationError:
         return None  # too few points lie so near each other: the rounds before stand
