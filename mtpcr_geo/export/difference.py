@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import ComparesArrays, Image
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Pair
-from mtpcr_geo.export import geotiff, overviews
+from mtpcr_geo.export import geotiff, overviews, resample
 from mtpcr_geo.method.bev import coarsen
 
 GROUND_CELL_M = 0.5
@@ -47,14 +46,17 @@ def upright_target(pair: Pair) -> Bev:
         raise ValueError("the target has no BEV yet")
     if np.array_equal(pair.target.T_level_work, np.eye(4)):
         return bev
-    T_work_level = transforms.inverse(pair.target.T_level_work)
-    return geotiff.warp_bev(bev, T_work_level, geotiff.grid_around(bev, T_work_level))
+    return resample.placed_whole(pair.target, np.eye(4))
 
 
-def height_difference(pair: Pair) -> HeightDifference | None:
+def height_difference(pair: Pair, registered: Bev | None = None) -> HeightDifference | None:
     """Compare the heights of both clouds cell by cell where they overlap.
 
     The cells are those of the target's raster, or blocks of them of half a metre at least.
+
+    Args:
+        pair: with a transform and both rasters.
+        registered: what `mtpcr_geo.export.resample.registered_bev` made of it, where it is there already.
 
     Returns:
         The difference, cut to the overlap; None where no cell has points of both.
@@ -66,8 +68,8 @@ def height_difference(pair: Pair) -> HeightDifference | None:
     if pair.T_target_source is None or pair.source.bev is None:
         raise ValueError("the pair needs a transform and both rasters to be compared")
     target = upright_target(pair)
-    T_target_levelled = pair.T_target_source @ transforms.inverse(pair.source.T_level_work)
-    moved = geotiff.grid_around(pair.source.bev, T_target_levelled)
+    whole = resample.registered_bev(pair) if registered is None else registered
+    moved = whole.grid
     ends = np.array(
         [
             [moved.west, moved.north],
@@ -82,7 +84,7 @@ def height_difference(pair: Pair) -> HeightDifference | None:
         return None
     part = target.grid.part(rows, columns)
     fixed = Bev(part, target.top[rows, columns], target.low[rows, columns], target.count[rows, columns])
-    source = geotiff.warp_bev(pair.source.bev, T_target_levelled, part)
+    source = resample.cut_to(whole, part) or resample.placed(pair.source, pair.T_target_source, part)
     fixed, source = coarsen(fixed, join), coarsen(source, join)
     low = source.low - fixed.low
     both = np.isfinite(low)

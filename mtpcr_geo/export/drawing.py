@@ -9,7 +9,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats, Image, Mask
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Pair
-from mtpcr_geo.export.geotiff import grid_around, warp_bev
+from mtpcr_geo.export.resample import cut_to, grid_around, placed, snapped, warp_bev
 
 Picture = NDArray[np.uint8]
 
@@ -213,7 +213,9 @@ def matches_picture(pair: Pair, max_side: int = 1400, most: int = 150) -> Pictur
 
 
 def common_rasters(pair: Pair, margin_m: float = 15.0, max_side: int = 1600) -> tuple[Bev, Bev]:
-    """Resample both BEVs onto one grid where they overlap, in levelled target coordinates.
+    """Return both BEVs on one grid where they overlap, in levelled target coordinates.
+
+    See `mtpcr_geo.export.resample.placed` for what their cells hold.
 
     Args:
         pair: with BEVs and a transform.
@@ -240,7 +242,11 @@ def common_rasters(pair: Pair, margin_m: float = 15.0, max_side: int = 1600) -> 
     cell = max(target.grid.cell, source.grid.cell)
     longest = max(grid.shape) * grid.cell + 2 * margin_m
     grid = _regrid(grid, margin_m, cell * max(1.0, longest / cell / max_side))
-    return warp_bev(source, T, grid), warp_bev(target, np.eye(4), grid)
+    if grid.cell == target.grid.cell:
+        grid = snapped(grid, target.grid)
+    T_level = pair.target.T_level_work
+    fixed = cut_to(target, grid) or placed(pair.target, T_level, grid)
+    return placed(pair.source, T_level @ pair.T_target_source, grid), fixed
 
 
 def _crop(grid: Grid, mask: Mask) -> Grid:

@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mtpcr_geo.core.grid import Grid
-from mtpcr_geo.core.types import Bev, Floats, Pair
+from mtpcr_geo.core.types import Bev, Pair
 from mtpcr_geo.export import drawing
-from mtpcr_geo.export.geotiff import grid_around, warp_bev
+from mtpcr_geo.export.resample import placed_whole
 from mtpcr_geo.method.bev import coarsen
 
 _MOST_CELLS = 500  # of a side of the left panel
@@ -65,7 +65,8 @@ def registration_figure(pair: Pair, title: str = "") -> RegistrationFigure:
             axes.set(title=f"{role} (not registered)", xlabel="x (m)", ylabel="y (m)")
         return figure
     shown = pair.with_(source=replace(pair.source, bev=source), target=replace(pair.target, bev=target))
-    _draw_over(left, source, target, pair.levelled(pair.T_target_source))
+    moved = placed_whole(shown.source, pair.target.T_level_work @ pair.T_target_source)
+    _draw_over(left, target, moved)
     left.set_title("registered source (coloured) over target (grey)", fontsize="medium")
     _draw_difference(figure, right, *_middle(*drawing.common_rasters(shown)))
     right.set_title("lowest heights, source minus target", fontsize="medium")
@@ -91,9 +92,8 @@ def _draw_difference(figure: Figure, axes: Axes, source: Bev, target: Bev) -> No
     figure.colorbar(picture, ax=axes, label="metres", extend="both", shrink=0.8)
 
 
-def _draw_over(axes: Axes, source: Bev, target: Bev, T: Floats) -> None:
-    """Draw the target in grey, and over it the source in colours of height."""
-    moved = warp_bev(source, T, grid_around(source, T))
+def _draw_over(axes: Axes, target: Bev, moved: Bev) -> None:
+    """Draw the target in grey, and over it the registered source in colours of height."""
     grey = drawing.hillshade(target.top, target.grid.cell)
     _show(axes, np.where(grey == 0, 255, grey).astype(np.uint8), target.grid)
     relief = drawing.shaded_relief(moved.top, moved.grid.cell)

@@ -239,7 +239,7 @@ def _refined_finely(
     T_start: Floats,
     settings: RefineSettings,
     agreeing: Callable[[Floats], int],
-    T_axes: tuple[Floats | None, Floats | None],
+    T_axes: tuple[Floats | None, Floats | None] = (None, None),
 ) -> _Fine | None:
     """Run a last round of ICP as fine as the density allows; None where that brings nothing.
 

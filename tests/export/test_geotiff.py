@@ -18,7 +18,7 @@ from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev
 from mtpcr_geo.crs import FrameLink, WorkFrame
 from mtpcr_geo.crs.chain import TransformChain
-from mtpcr_geo.export import geotiff, tie_points
+from mtpcr_geo.export import geotiff, resample, tie_points
 from mtpcr_geo.export.geopackage import Layer, blob, write_geopackage
 
 
@@ -169,8 +169,8 @@ def test_registered_source_lies_on_the_target(tmp_path, tilt):
 def test_warp_by_whole_cells_is_exact():
     bev = tiny_bev()
     T = transforms.translation((2.0, -1.0, 3.0))
-    grid = geotiff.grid_around(bev, T)
-    moved = geotiff.warp_bev(bev, T, grid)
+    grid = resample.grid_around(bev, T)
+    moved = resample.warp_bev(bev, T, grid)
     column, row = np.rint(grid.to_pixel(np.array([[-9.75 + 2.0, 19.25 - 1.0]])))[0].astype(int)
     assert moved.top[row, column] == pytest.approx(7.5)
     assert moved.count.sum() == bev.count.sum()
@@ -184,7 +184,7 @@ def test_a_thin_scan_keeps_its_cells_under_a_tilt():
     count = np.isfinite(top).astype(np.uint32)
     bev = Bev(Grid(-20.0, 15.0, 0.5, 80, 60), top, top, count)
     T = transforms.compose(transforms.tilt_matrix(0.7, 0.12), np.array([3.0, 1.0, 0.5]))
-    moved = geotiff.warp_bev(bev, T, geotiff.grid_around(bev, T))
+    moved = resample.warp_bev(bev, T, resample.grid_around(bev, T))
     row, column = np.nonzero(count)
     plan = bev.grid.to_metres(np.column_stack([column, row]).astype(float))
     xyz = transforms.apply(T, np.column_stack([plan, top[row, column]]))

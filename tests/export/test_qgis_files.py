@@ -20,7 +20,7 @@ from rasterio.enums import ColorInterp
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.core.types import Hypothesis, Pair, Rival, Verdict
-from mtpcr_geo.export import difference, georeferencer, geotiff, raster_styles, styles, tie_points
+from mtpcr_geo.export import difference, georeferencer, geotiff, raster_styles, resample, styles, tie_points
 from mtpcr_geo.export.qgis.layers import LayerFile
 from mtpcr_geo.export.qgis.project import About, write_project
 from mtpcr_geo.pipeline.runner import RunResult
@@ -99,7 +99,7 @@ def test_the_difference_is_registered_minus_target(tmp_path, tilt):
         assert np.nanmedian(top) == pytest.approx(expected, abs=0.05)
     # each cell is the one of the registered raster less that of the target
     if tilt == 0.0:
-        moved = geotiff.registered_bev(pair)
+        moved = resample.registered_bev(pair)
         found = difference.height_difference(pair)
         assert found is not None
         row, column = np.argwhere(np.isfinite(found.low))[0]

@@ -13,7 +13,6 @@ from mtpcr_geo.core.arrays import Floats, Image, Mask
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Pair
 from mtpcr_geo.export import drawing
-from mtpcr_geo.export.geotiff import grid_around, warp_bev
 from mtpcr_geo.export.report.rasters import (
     Window,
     closed,
@@ -25,6 +24,7 @@ from mtpcr_geo.export.report.rasters import (
     telling_window,
     windows_of,
 )
+from mtpcr_geo.export.resample import cut_to, grid_around, placed, snapped, warp_bev
 from mtpcr_geo.method.bev import coarsen
 from mtpcr_geo.method.overlap import CommonGround, overlap_of
 from mtpcr_geo.method.scales import ground_cell_for
@@ -283,7 +283,10 @@ def before_and_after(pair: Pair) -> Swipe:
     cell = max(cell, float((high - low).max()) / _WIDE_PX)
     width, height = (int(size) for size in np.maximum(np.ceil((high - low) / cell), 1))
     grid = Grid(float(low[0]), float(high[1]), cell, width, height)
-    ground = closed(warp_bev(target, np.eye(4), grid).top)
+    if cell == target.grid.cell:
+        grid = snapped(grid, target.grid)
+    T_level = pair.target.T_level_work
+    ground = closed((cut_to(target, grid) or placed(pair.target, T_level, grid)).top)
     factor = max(1, _WIDE_PX // max(grid.shape))
     ground = smooth_larger(ground, factor)
     seen = np.isfinite(ground)
@@ -293,8 +296,11 @@ def before_and_after(pair: Pair) -> Swipe:
         np.float32(130.0),
     )
     pictures = []
-    for T in (before, after):
-        over = smooth_larger(closed(warp_bev(source, T, grid).top), factor)
+    for moved in (
+        warp_bev(source, before, grid),
+        placed(pair.source, T_level @ pair.T_target_source, grid),
+    ):
+        over = smooth_larger(closed(moved.top), factor)
         pictures.append(_laid_over(over, base, seen, cell / factor))
     return Swipe(pictures[0], pictures[1], cell / factor, as_it_lay)
 

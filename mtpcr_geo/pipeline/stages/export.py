@@ -164,13 +164,14 @@ class WriteBev(EvidenceWriter):
         """Write what there is once a transform is found: heights of both with the same colours."""
         from mtpcr_geo.export.difference import height_difference, upright_target, write_difference
         from mtpcr_geo.export.georeferencer import write_points
-        from mtpcr_geo.export.geotiff import registered_bev, write_bev, write_registered_bev
+        from mtpcr_geo.export.geotiff import write_bev, write_registered_bev
         from mtpcr_geo.export.raster_styles import (
             difference_limit,
             difference_style,
             height_limits,
             relief_style,
         )
+        from mtpcr_geo.export.resample import registered_bev
 
         registered, difference_file, upright_file = (self._file(role) for role in DERIVED_ROLES)
         upright = upright_target(pair)
@@ -183,7 +184,7 @@ class WriteBev(EvidenceWriter):
             tags = {"ROLE": "target, upright", "CLOUD": Path(pair.target.cloud.name).name}
             write_bev(context.outputs.path(upright_file), upright, pair.frame, tags=tags)
             self._style(context, upright_file, relief_style(low + z, high + z))
-        difference = height_difference(pair)
+        difference = height_difference(pair, moved)
         if difference is None:
             why = "the clouds share no cell"
             styled = difference_file.with_suffix(".qml")
