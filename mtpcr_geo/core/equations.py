@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,4 +63,24 @@ class BlockEquations(ComparesArrays):
             quarter_centres=transforms.apply(T, self.quarter_centres),
             gap_m=self.gap_m,
             fitted=self.fitted,
+        )
+
+    def in_frame(self, A: Floats) -> BlockEquations:
+        """Return the same equations in another frame of the target.
+
+        Args:
+            A: 4x4 rigid transform from the target's coordinates so far to the new ones.
+
+        """
+        Q = np.kron(np.eye(2), A[:3, :3])
+        pivot, *_ = transforms.apply(A, self.pivot[None])
+        return replace(
+            self,
+            T=A @ self.T,
+            pivot=pivot,
+            centres=transforms.apply(A, self.centres),
+            H=Q @ self.H @ Q.T,
+            b=self.b @ Q.T,
+            quarters=self.quarters @ Q.T,
+            quarter_centres=transforms.apply(A, self.quarter_centres),
         )

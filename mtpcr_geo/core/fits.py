@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -237,3 +237,29 @@ class Refinement(ComparesArrays):
         }
         found: dict[str, Any] = {name: step.audit() for name, step in steps.items() if step is not None}
         return found if self.slid_m is None else {**found, "slid_m": self.slid_m}
+
+    def in_frame(self, A: Floats) -> Refinement:
+        """Return the same refinement in another frame of the target.
+
+        Args:
+            A: 4x4 rigid transform from the target's coordinates so far to the new ones.
+
+        """
+
+        def grounded(fit: GroundFit | None) -> GroundFit | None:
+            return None if fit is None else replace(fit, T=A @ fit.T)
+
+        icp = self.icp
+        if icp is not None:
+            surfaces = None if icp.T_surfaces is None else A @ icp.T_surfaces
+            icp = replace(icp, T=A @ icp.T, T_surfaces=surfaces)
+        return replace(
+            self,
+            T=A @ self.T,
+            T_before=A @ self.T_before,
+            ground_before=grounded(self.ground_before),
+            icp=icp,
+            ground_after=grounded(self.ground_after),
+            equations=None if self.equations is None else self.equations.in_frame(A),
+            T_solved=None if self.T_solved is None else A @ self.T_solved,
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,14 @@ from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.statistics import chance_within
 from mtpcr_geo.core.types import Hypothesis, Matches, Pair, Rival, SolveSettings, TiePoints
+from mtpcr_geo.core.uncertainty import Uncertainty
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.match.base import margin_of
 from mtpcr_geo.method.overlap import overlap_of
 from mtpcr_geo.method.scales import MAX_LEAST_OVERLAP_M2, ground_cell_for, scales_of, tolerance_for
 from mtpcr_geo.method.shortcomings import what_is_missing
 from mtpcr_geo.method.solve import solve_tie_points
+from mtpcr_geo.method.upright import seen_upright
 from mtpcr_geo.verdict.findings import UNBOUNDED_CHANCE
 from mtpcr_geo.verdict.further import with_further
 from mtpcr_geo.verdict.limits import Evidence
@@ -56,8 +59,11 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         tie_points, tolerance, pair.solution.settings if pair.solution else SolveSettings()
     )
     agreeing = held_out < tolerance
-    moved = transforms.apply(T, pair.source.sample)
-    overlap = overlap_of(moved, pair.target.sample, ground_cell_for(cell))
+    # ground and what stands on it are told apart along the vertical
+    seen = seen_upright(pair)
+    assert seen.T_target_source is not None
+    moved = transforms.apply(seen.T_target_source, pair.source.sample)
+    overlap = overlap_of(moved, seen.target.sample, ground_cell_for(cell))
     ground = overlap.common_ground()
     shape = ground.shape()
     icp = pair.refinement.icp if pair.refinement is not None else None
@@ -71,7 +77,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         support=matches.support if matches is not None else None,
         overlap_m2=overlap.area_m2,
         overlap_source=float(overlap.select(moved).mean()),
-        overlap_target=float(overlap.select(pair.target.sample).mean()),
+        overlap_target=float(overlap.select(seen.target.sample).mean()),
         ground_cells=len(ground.step),
         ground_agreeing=int((np.abs(ground.step) < GROUND_AGREES_M).sum()),
         ground_spread_m=shape.spread_m if np.isfinite(shape.spread_m) else None,
@@ -95,7 +101,9 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         ),
     )
     del moved  # as large as the source
-    evidence, further = with_further(evidence, pair, overlap, ground, tie_points, agreeing)
+    evidence, further = with_further(evidence, seen, overlap, ground, tie_points, agreeing)
+    if seen is not pair and evidence.uncertainty is not None:
+        evidence = replace(evidence, uncertainty=_in_work_frame(evidence.uncertainty, pair))
     shift = T[:3, 3]
     offset = TransformChain.of(pair).vertical_offset_m
     more = {
@@ -110,6 +118,13 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         **further,
     }
     return evidence, more
+
+
+def _in_work_frame(uncertainty: Uncertainty, pair: Pair) -> Uncertainty:
+    """Take an uncertainty from the frame of the levelled target to that of its work coordinates."""
+    T_work = transforms.inverse(pair.target.T_level_work)
+    pivot, far = transforms.apply(T_work, np.array([uncertainty.pivot, uncertainty.far]))
+    return replace(uncertainty, pivot=pivot, far=far, R_level=pair.target.T_level_work[:3, :3])
 
 
 def chance_of(matches: Matches | None, tolerance: float) -> float | None:
@@ -199,8 +214,10 @@ def agreement(pair: Pair, T: Floats, tolerance: float | None = None) -> tuple[in
         tolerance: plan distance within which a tie point agrees, metres; one cell if None.
 
     """
-    moved = transforms.apply(T, pair.source.sample)
-    _, steps = overlap_of(moved, pair.target.sample, ground_cell_for(pair.cell)).ground_steps()
+    seen = seen_upright(pair.with_(T_target_source=T, refinement=None))
+    assert seen.T_target_source is not None
+    moved = transforms.apply(seen.T_target_source, pair.source.sample)
+    _, steps = overlap_of(moved, seen.target.sample, ground_cell_for(pair.cell)).ground_steps()
     return tie_points_agreeing(pair, T, tolerance), int((np.abs(steps) < GROUND_AGREES_M).sum())
 
 

@@ -28,6 +28,7 @@ from mtpcr_geo.export.resample import cut_to, grid_around, placed, snapped, warp
 from mtpcr_geo.method.bev import coarsen
 from mtpcr_geo.method.overlap import CommonGround, overlap_of
 from mtpcr_geo.method.scales import ground_cell_for
+from mtpcr_geo.method.upright import seen_upright
 
 _ZOOM_PX = 760
 _PATCH_PX = 420
@@ -100,9 +101,10 @@ class Overlay:
     @cached_property
     def ground(self) -> CommonGround:
         """The ground that both see, as the checks compare it."""
-        assert self.pair.T_target_source is not None
-        moved = transforms.apply(self.pair.T_target_source, self.pair.source.sample)
-        return overlap_of(moved, self.pair.target.sample, ground_cell_for(self.pair.cell)).common_ground()
+        seen = seen_upright(self.pair)
+        assert seen.T_target_source is not None
+        moved = transforms.apply(seen.T_target_source, seen.source.sample)
+        return overlap_of(moved, seen.target.sample, ground_cell_for(seen.cell)).common_ground()
 
     @cached_property
     def box(self) -> Window:

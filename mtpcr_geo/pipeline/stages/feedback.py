@@ -23,6 +23,7 @@ from mtpcr_geo.method.inverse_mapping import tie_points_of
 from mtpcr_geo.method.refine import FEW_TIE_POINTS, RefineSettings, refine, target_moves
 from mtpcr_geo.method.scales import tolerance_for
 from mtpcr_geo.method.solve import solve_tie_points
+from mtpcr_geo.method.upright import seen_upright
 from mtpcr_geo.pipeline.stages.views import shown, view_of
 from mtpcr_geo.verdict.evidence import middle_of_tie_points, moved_in_plan, tie_points_agreeing
 
@@ -310,17 +311,19 @@ def refined_pair(pair: Pair, settings: RefineSettings) -> Refinement:
         RegistrationError: if too little of the clouds is brought together.
 
     """
-    assert pair.T_target_source is not None
-    return refine(
-        pair.source.sample,
-        pair.target.sample,
-        pair.T_target_source,
+    seen = seen_upright(pair)
+    assert seen.T_target_source is not None
+    found = refine(
+        seen.source.sample,
+        seen.target.sample,
+        seen.T_target_source,
         settings,
         cell=pair.cell,
-        agreeing=lambda T: tie_points_agreeing(pair, T),
+        agreeing=lambda T: tie_points_agreeing(seen, T),
         pivot=middle_of_tie_points(pair),
-        R_upright=pair.target.T_level_work[:3, :3].T @ pair.source.T_level_work[:3, :3],
+        R_upright=seen.target.T_level_work[:3, :3].T @ seen.source.T_level_work[:3, :3],
     )
+    return found if seen is pair else found.in_frame(transforms.inverse(pair.target.T_level_work))
 
 
 def _solved(again: Pair, before: Pair) -> Pair:
