@@ -21,7 +21,7 @@ from mtpcr_geo.match.search import GlobalSearch, Layer, all_yaws, distinct
 from mtpcr_geo.match.terrain import Terrain, cell_to_compare
 from mtpcr_geo.match.terrain_search import propose
 from mtpcr_geo.method.ground import bare
-from mtpcr_geo.method.scales import Scales
+from mtpcr_geo.method.scales import Scales, tolerance_for
 
 COARSEST_YAW_STEP_DEG, FINEST_YAW_STEP_DEG = 4.0, 2.0
 FEWEST_OVERLAP_CELLS = 20
@@ -288,12 +288,19 @@ class Exploration:
     def _rank(self) -> None:
         """Rank what was judged; the best is judged at the finest cells, if a first look had been enough."""
         bound = max([self._bound, *(pose.score for pose in self._left)])
-        self.pool = Pool.of(self.judged, self.scales, bound)
+        self.pool = Pool.of(self._among(), self.scales, bound)
         while self.pool.candidates and not self.pool.candidates[0].complete:
             best = self.pool.candidates[0]
             number = next(k for k, one in enumerate(self.judged) if one is best)
             self.judged[number] = self.judge.judge_one(best.pose)
-            self.pool = Pool.of(self.judged, self.scales, bound)
+            self.pool = Pool.of(self._among(), self.scales, bound)
+
+    def _among(self) -> list[Candidate]:
+        """Return what was judged and lies within the prior, or all where nothing does: combing leads out."""
+        if self.prior is None:
+            return self.judged
+        grid, slack = self.pyramid.source.grid, tolerance_for(self.scales.cell_m)
+        return [one for one in self.judged if self.prior.allows(one.pose, grid, slack)] or self.judged
 
     def _comb_about_the_best(self, known: float) -> None:
         """Judge the best place near the best hypothesis too, where that is another."""
@@ -342,7 +349,7 @@ class Exploration:
         What wins by the ground alone may be beaten by one that nothing has proposed yet; so may, where the
         scene repeats itself, one under which most patches disagree.
         """
-        if not self.pool.by_itself(self.judged):
+        if not self.pool.by_itself(self._among()):
             return False
         return self.pool.candidates[0].support >= LEAST_SUPPORT_OF_ROWS or not self.repeats()
 

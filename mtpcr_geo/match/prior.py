@@ -14,7 +14,7 @@ from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Hypothesis
 from mtpcr_geo.match.pose import Pose, centre_of, pose_of
-from mtpcr_geo.match.search import Layer
+from mtpcr_geo.match.search import Layer, angle_between
 from mtpcr_geo.match.terrain import Terrain
 from mtpcr_geo.method.images import Channels
 
@@ -81,6 +81,23 @@ class Prior:
         """Return the pose about the centre of a raster of the source; None if no whole pose is known."""
         at = self.place_of(grid)
         return None if at is None or self.yaw is None else Pose(self.yaw, *at(self.yaw))
+
+    def allows(self, pose: Pose, grid: Grid, slack_m: float) -> bool:
+        """Return whether a pose lies within what is known.
+
+        Args:
+            pose: about the centre of a raster of the source.
+            grid: of that raster.
+            slack_m: by how much it may lie beyond in place, or at the rim of the raster by its yaw, metres.
+
+        """
+        at = self.place_of(grid)
+        if at is not None:
+            east, north = at(pose.yaw)
+            if float(np.hypot(pose.east - east, pose.north - north)) > self.radius_m + slack_m:
+                return False
+        rim = np.hypot(grid.width, grid.height) * grid.cell / 2
+        return self.yaw is None or angle_between(pose.yaw, self.yaw) <= self.yaw_range + slack_m / rim
 
     def layer(self, source: Grid, target: Layer) -> Layer | None:
         """Return the part of a target's layer that the source can reach; None if that is empty."""

@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection
 
 from mtpcr_geo.core.types import Check
 from mtpcr_geo.core.wording import beside, percent
+from mtpcr_geo.match.base import LARGEST_MARGIN
 from mtpcr_geo.verdict.findings import (
     FEWEST_GROUND_CELLS,
     FEWEST_HELD_OUT,
@@ -91,7 +92,11 @@ def _margin(evidence: Evidence, limits: Limits) -> Check:
     if evidence.margin is None:
         return Check("next distinct pose", "not known", f"{limits.margin:g} times", None, meaning)
     value, wanted = beside(evidence.margin, limits.margin, 2)
-    return Check("next distinct pose", f"{value} times", f"at least {wanted} times", True, meaning)
+    if evidence.prior_given:
+        meaning += " Only poses about what was known beforehand were searched: the probability counts it for "
+        meaning += "no more than the mirrored source's."
+    value = "no other" if evidence.margin >= LARGEST_MARGIN else f"{value} times"
+    return Check("next distinct pose", value, f"at least {wanted} times", True, meaning)
 
 
 def _mirrored(evidence: Evidence, limits: Limits) -> Check:

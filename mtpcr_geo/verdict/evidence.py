@@ -93,6 +93,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         final_agreeing=int((residual < tolerance).sum()),
         missing=_missing(pair),
         rivals=rivals_of(pair, tolerance),
+        prior_given=pair.known is not None,
         mapped=pair.frame.crs is not None,
         not_levelled=tuple(
             f"the {side.role} was not levelled: {side.levelling.why or 'nothing tells its vertical'}"

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from mtpcr_geo.core.statistics import neg_log10_p
 from mtpcr_geo.core.types import Rival
 from mtpcr_geo.core.wording import beside, only, percent
+from mtpcr_geo.match.base import LARGEST_MARGIN
 from mtpcr_geo.verdict.limits import Evidence, Limits
 from mtpcr_geo.verdict.probability import may_repeat, rows_over_noise
 
@@ -58,7 +59,12 @@ def against_others(evidence: Evidence) -> list[str]:
     """Say how far the pose stands above the next distinct one and the mirrored source."""
     found = []
     if evidence.margin is not None:
-        found.append(f"the next distinct pose is {_times(evidence.margin, 'weaker', 'stronger')}")
+        where = " about what was known beforehand" if evidence.prior_given else ""
+        found.append(
+            f"no other distinct pose was found{where}"
+            if evidence.margin >= LARGEST_MARGIN
+            else f"the next distinct pose{where} is {_times(evidence.margin, 'weaker', 'stronger')}"
+        )
     if evidence.null_ratio is not None:
         worse = _times(evidence.null_ratio, "worse", "better")
         found.append(f"the mirrored source, which has no right pose, fits {worse}")
@@ -172,13 +178,13 @@ def margin_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
         text = f"{len(near)} other poses fit nearly as well (margin {value}, wanted {wanted}): {others}"
     else:
         text = f"{what} fits nearly as well (margin {value}, wanted {wanted})"
-    return CheckFinding(f"{text}; {_AGAINST_RIVALS}", refuses=margin < 1.0)
+    advice = "give larger parts of the clouds"
+    advice += ", or say more exactly" if evidence.prior_given else ", or say roughly"
+    return CheckFinding(f"{text}; {_REPEATS_ITSELF}: {advice} {_WHERE}", refuses=margin < 1.0)
 
 
-_AGAINST_RIVALS = (
-    "the site repeats itself, or too little of it is shared: give larger parts of the clouds, or say "
-    "roughly where the source lies (options near, yaw, prior)"
-)
+_REPEATS_ITSELF = "the site repeats itself, or too little of it is shared"
+_WHERE = "where the source lies (options near, yaw, prior)"
 
 
 def rival_text(rival: Rival, mapped: bool) -> str:

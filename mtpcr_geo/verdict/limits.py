@@ -54,6 +54,7 @@ class Evidence:
         sliding: the motion in plan that the fit tells least; None where that is not known.
         drift: how what is left bends along the overlap; None where that is not known.
         contradictions: what was known beforehand and is not so, a sentence each.
+        prior_given: whether place or yaw were known beforehand, so that only poses about these were searched.
 
     """
 
@@ -91,6 +92,7 @@ class Evidence:
     objects_missing: float | None = None
     sliding: Sliding | None = None
     drift: Drift | None = None
+    prior_given: bool = False
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mtpcr_geo.match.base import LARGEST_MARGIN
 from mtpcr_geo.verdict.decision import Limits, assess, metrics_of
 from mtpcr_geo.verdict.findings import noise_of_rows
 from mtpcr_geo.verdict.limits import Evidence
@@ -90,6 +91,27 @@ def test_another_place_with_the_same_rows_is_caught_by_the_shape_of_its_ground()
     verdict = assess(rows, Limits())
     assert verdict.name != "accepted"
     assert any("differs in shape" in reason for reason in verdict.reasons)
+
+
+def test_about_a_prior_a_next_pose_that_is_weak_or_missing_proves_nothing() -> None:
+    # unrelated plots about a prior of 1.5 m and 3 degrees, of which 6 of 17 tie points agreed
+    unrelated = {
+        "margin": 11.0, "null_ratio": 2.99, "held_out": 17, "held_out_agreeing": 6, "ground_cells": 60,
+        "ground_agreeing": 60, "ground_spread_m": None, "ground_relief_m": None,
+    }  # fmt: skip
+    assert probability(**unrelated, prior_given=True) < probability(**unrelated)
+    assert probability(**{**unrelated, "margin": LARGEST_MARGIN}, prior_given=True) == pytest.approx(
+        probability(**{**unrelated, "margin": 2.99}, prior_given=True)
+    )
+    # a rival counts as ever
+    assert probability(margin=1.2, prior_given=True) == probability(margin=1.2)
+    alone = assess(replace(CLEAR, margin=LARGEST_MARGIN, prior_given=True), Limits())
+    assert alone.name == "accepted"
+    assert any(reason.startswith("no other distinct pose was found") for reason in alone.reasons)
+    (check,) = (one for one in alone.checks if one.name == "next distinct pose")
+    assert (check.value, check.passed) == ("no other", True)
+    rivalled = assess(replace(CLEAR, margin=1.1, prior_given=True), Limits())
+    assert any("say more exactly where the source lies" in reason for reason in rivalled.reasons)
 
 
 def test_among_rows_the_ground_must_agree_to_its_noise() -> None:
