@@ -13,6 +13,8 @@ from mtpcr_geo.core.arrays import ComparesArrays, Floats
 from mtpcr_geo.core.frames import FrameLink, box_points, fit_affine
 
 if TYPE_CHECKING:
+    from pyproj import CRS
+
     from mtpcr_geo.core.types import Pair
 
 
@@ -26,6 +28,8 @@ class TransformChain(ComparesArrays):
         T_target_source: 4x4 rigid transform in work coordinates, metres.
         pivot: (3,) centroid of the source, in source file coordinates.
         bounds: (2, 3) of the source, in source file coordinates.
+        source_stated: CRS that the source's file states, or None; another one may have been given by option.
+        target_stated: likewise of the target; None where the result is in another CRS, which was asked for.
 
     """
 
@@ -34,6 +38,8 @@ class TransformChain(ComparesArrays):
     T_target_source: Floats
     pivot: Floats
     bounds: Floats
+    source_stated: CRS | None = None
+    target_stated: CRS | None = None
 
     @classmethod
     def of(cls, pair: Pair) -> TransformChain:
@@ -56,6 +62,8 @@ class TransformChain(ComparesArrays):
             bounds=np.stack([cloud.minimum, cloud.maximum]).astype(np.float64)
             if pair.source.bounds is None
             else pair.source.bounds,
+            source_stated=cloud.crs,
+            target_stated=None if pair.frame.output is not None else pair.target.cloud.crs,
         )
 
     def forward(self, xyz: Floats) -> Floats:

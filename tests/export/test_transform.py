@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 
+import mtpcr_geo as mg
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import CrsError, InputError, OutputError
@@ -336,6 +337,65 @@ def test_apply_writes_no_other_format_and_never_over_its_own_transform(tmp_path)
         with pytest.raises((InputError, OutputError), match=words):
             apply_transform(tmp_path / "t.json", tmp_path / "source.laz", tmp_path / name, overwrite=True)
     assert (tmp_path / "t.json").read_bytes() == before
+
+
+WITH_HEIGHTS = "EPSG:2993+5703"  # the metric test system, heights above NAVD88
+
+
+@pytest.mark.parametrize("side", ["source", "target"])
+def test_apply_takes_the_file_that_was_registered_by_a_crs_given_for_it(tmp_path, side):
+    stated = CRS.from_epsg(4326) if side == "source" else UTM
+    source = ArrayCloud(site(), stated, name="source.laz")
+    target = ArrayCloud(site(seed=1), CRS.from_epsg(26910), name="target.laz")
+    frame, target_link, source_link = resolve_frames(
+        target, source, source_crs=WITH_HEIGHTS, target_crs=WITH_HEIGHTS
+    )
+    sides = [
+        Side("target", target, target_link, target_link.to_work(target.xyz)),
+        Side("source", source, source_link, source_link.to_work(source.xyz)),
+    ]
+    pair = Pair(target=sides[0], source=sides[1], frame=frame, T_target_source=T_WORK)
+    write_transform_json(tmp_path / "t.json", pair)
+    chain = read_transform(tmp_path / "t.json")
+    inverse = side == "target"
+    given, other = (target, source) if inverse else (source, target)
+    assert moved_by(chain, given, inverse=inverse).count == 600
+    assert moved_by(TransformChain.of(pair), given, inverse=inverse).count == 600
+    with pytest.raises(CrsError, match="--cloud-crs"):
+        moved_by(chain, ArrayCloud(site(), FEET), inverse=inverse)
+    if side == "source":
+        with pytest.raises(CrsError, match="starts from"):
+            moved_by(chain, other, inverse=inverse)
+
+
+def test_apply_takes_a_cloud_that_states_the_plan_alone(tmp_path):
+    pair = a_pair(source_crs=CRS.from_user_input(WITH_HEIGHTS), target_crs=CRS.from_user_input(WITH_HEIGHTS))
+    chain = TransformChain.of(pair)
+    silent = ArrayCloud(site(), UTM)
+    assert np.array_equal(moved_by(chain, silent).to_array(), chain.forward(site()))
+    # heights of another kind, or in another unit, are not those of the frame
+    for other in ("EPSG:2993+6360", "EPSG:2993+5702", "EPSG:2994", "EPSG:26910"):
+        with pytest.raises(CrsError, match="starts from"):
+            moved_by(chain, ArrayCloud(site(), CRS.from_user_input(other)))
+    with pytest.raises(CrsError, match="starts from"):
+        moved_by(TransformChain.of(a_pair()), ArrayCloud(site(), CRS.from_user_input(WITH_HEIGHTS)))
+
+
+def test_apply_takes_the_crs_that_is_given_instead_of_the_one_stated(tmp_path):
+    pair = a_pair()
+    write_transform_json(tmp_path / "t.json", pair)
+    write_cloud(tmp_path / "in.laz", ArrayCloud(site(), CRS.from_epsg(26910)), None, CRS.from_epsg(26910))
+    paths = tmp_path / "t.json", tmp_path / "in.laz", tmp_path / "out.laz"
+    with pytest.raises(CrsError, match="--cloud-crs"):
+        apply_transform(*paths)
+    with pytest.raises(CrsError, match=r"give cloud_crs if"):
+        mg.apply(*paths[:2])
+    apply_transform(*paths, cloud_crs="EPSG:2993")
+    expected = TransformChain.of(pair).forward(site())
+    assert np.abs(open_cloud(tmp_path / "out.laz").to_array() - expected).max() < 0.002
+    moved = mg.apply(*paths[:2], cloud_crs="local")
+    assert isinstance(moved, Cloud)
+    assert np.abs(moved.to_array() - expected).max() < 0.002
 
 
 @pytest.mark.parametrize("inverse", [False, True])
