@@ -362,7 +362,7 @@ def apply(
         out: a file to write the moved cloud to, its ending the format; nothing is written if not given.
         inverse: go from target to source.
         overwrite: replace `out` if it is there.
-        scale: storage step of a LAS file, in units of its CRS.
+        scale: storage step of a LAS file, in units of its CRS; metres where those are degrees.
         cloud_crs: CRS of a cloud, taken instead of what it states; "local" if it has none.
         progress: where to report the points written.
 

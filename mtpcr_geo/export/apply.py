@@ -61,7 +61,7 @@ def apply_transform(
         say: called with a sentence where points or dimensions were left out, or the cloud lies far from the
             one that was registered.
         text: layout of a cloud that is text, see `mtpcr_geo.io.formats.text_layout.TextLayout.read`.
-        scale: storage step of a LAS file, in units of its CRS.
+        scale: storage step of a LAS file, in units of its CRS; metres where those are degrees.
         cloud_crs: CRS of the cloud, taken instead of what its file states; "local" if it has none.
 
     Returns:
@@ -249,7 +249,7 @@ def write_moved(
         overwrite: whether `out_path` may be replaced.
         reads: files that are read, and never replaced.
         progress: where to report the points written.
-        scale: storage step of a LAS file, in units of its CRS.
+        scale: storage step of a LAS file, in units of its CRS; metres where those are degrees.
 
     Returns:
         What was left out, a sentence for each file and kind.

@@ -57,8 +57,9 @@ def write_cloud(
         cloud: what to write.
         move: takes (n, 3) file coordinates of `cloud` to those to be written; None leaves them.
         crs: CRS of the written coordinates; None states none.
-        scale: storage step of coordinates, in units of `crs`; None takes 0.001, or the input's own if that is
-            finer, down to 0.0001. For geographic coordinates 1e-9 degrees.
+        scale: storage step of coordinates, in units of `crs`, or in metres where those are degrees; a tuple
+            is in units of each axis, degrees too. None takes 0.001, or the input's own if that is finer, down
+            to 0.0001. For geographic coordinates 1e-9 degrees.
         progress: where to report the points written.
         advance: called with the number of points of each chunk written.
         returning: choose a scale so fine that the cloud can be moved back onto its coordinates.
@@ -203,11 +204,15 @@ def scales_of(
     Args:
         cloud: what is written.
         crs: of the written coordinates.
-        given: scales asked for.
+        given: scale asked for: a length, which in geographic coordinates is turned to degrees; or one for
+            each axis in its own unit.
 
     """
     if given is not None:
-        return np.broadcast_to(np.asarray(given, np.float64), 3).copy()
+        scales = np.broadcast_to(np.asarray(given, np.float64), 3).copy()
+        if np.ndim(given) == 0 and crs is not None and crs.is_geographic:
+            scales[:2] /= _METRES_A_DEGREE
+        return scales
     scales = np.full(3, STEP)
     if isinstance(cloud, LasCloud) and not (cloud.crs is not None and cloud.crs.is_geographic):
         scales = np.clip(cloud.header.scales, FINEST_STEP, STEP)
