@@ -146,7 +146,7 @@ def moved_by(
         )
     if crs is None:
         _check_near(chain, cloud, inverse)
-    return Moved(cloud, chain.inverse if inverse else chain.forward, end.file_crs)
+    return Moved(cloud, chain.motion(inverse), end.file_crs)
 
 
 def _claimed(cloud: Cloud, given: str | CRS | None) -> CRS | None:

@@ -14,6 +14,7 @@ from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 from mtpcr_geo.core.errors import CrsError
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.crs import TransformChain
+from mtpcr_geo.io.directions import turned_columns
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -138,7 +139,7 @@ class Moved(Cloud):
 
     Args:
         base: the cloud as it stands.
-        move: takes (n, 3) coordinates of `base` to the new ones.
+        move: takes (n, 3) coordinates of `base` to the new ones; by a `Motion` normals turn with the points.
         crs: CRS of the new coordinates, or None for local ones.
 
     """
@@ -185,7 +186,7 @@ class Moved(Cloud):
         for table in self.base.table_chunks(size):
             xyz = self._moved(xyz_of(table))
             moved: PointTable = {axis: xyz[:, i] for i, axis in enumerate("XYZ")}
-            yield {**table, **moved}
+            yield {**table, **turned_columns(table, self.move), **moved}
 
     def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, NDArray[np.bool_]]]:
         """Yield moved coordinates (n, 3) and which of them are noise or withheld (n,), n <= size."""
@@ -203,4 +204,4 @@ def moved_source(pair: Pair) -> Moved:
 
     """
     chain = TransformChain.of(pair)
-    return Moved(pair.source.cloud, chain.forward, chain.target.file_crs)
+    return Moved(pair.source.cloud, chain.motion(), chain.target.file_crs)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import OutputError
+from mtpcr_geo.io.directions import turned_columns
 from mtpcr_geo.io.foreign import append_large, restore_texts
 from mtpcr_geo.io.las import LasCloud
 from mtpcr_geo.io.layout import layout
@@ -55,7 +56,8 @@ def write_cloud(
     Args:
         path: where to write; ``.las``, ``.laz`` or ``.copc.laz`` is the format.
         cloud: what to write.
-        move: takes (n, 3) file coordinates of `cloud` to those to be written; None leaves them.
+        move: takes (n, 3) file coordinates of `cloud` to those to be written; None leaves them. By a `Motion`
+            normals and directions of waveforms turn with the points.
         crs: CRS of the written coordinates; None states none.
         scale: storage step of coordinates, in units of `crs`, or in metres where those are degrees; a tuple
             is in units of each axis, degrees too. None takes 0.001, or the input's own if that is finer, down
@@ -248,6 +250,8 @@ def _placed(
                 np.subtract(moved[:, axis], offsets[axis], out=of_axis)
                 of_axis /= storage.scales[axis]
                 np.rint(of_axis, out=of_axis)
+        for name, vectors in turned_columns(packed, move).items():
+            packed[name] = vectors
         # a NaN makes it one
         worst = float(np.maximum(steps.max(), -steps.min()))
         kept = packed

@@ -28,8 +28,10 @@ from mtpcr_geo.export.transform import (
     write_transform_json,
 )
 from mtpcr_geo.io import ArrayCloud
+from mtpcr_geo.io.formats import open_any
 from mtpcr_geo.io.las import open_cloud
 from mtpcr_geo.io.write import write_cloud
+from mtpcr_geo.io.write_any import write_any
 
 UTM, FEET = CRS.from_epsg(2993), CRS.from_epsg(2994)
 GEOGRAPHIC = CRS.from_epsg(4152)  # the datum of both
@@ -475,3 +477,88 @@ def test_json_is_read_back_as_it_was(value):
 def test_numbers_have_17_digits():
     assert dumps(0.1) == "0.10000000000000001"
     assert dumps(np.array([[1.0, 2.5]])) == "[\n  [1.0, 2.5]\n]"
+
+
+def metres_of(crs, xyz):
+    """Metres a unit of x, y and z of coordinates at a place."""
+    if crs is None or crs == UTM:
+        return np.ones(3)
+    if crs == FEET:
+        return np.full(3, 0.3048)
+    lat = np.radians(xyz[0, 1])
+    lon_m = 111_412.84 * np.cos(lat) - 93.5 * np.cos(3 * lat)
+    return np.array([lon_m, 111_132.95 - 559.85 * np.cos(2 * lat) + 1.17 * np.cos(4 * lat), 1.0])
+
+
+def with_normals(xyz, crs, names, kind=np.float64):
+    rng = np.random.default_rng(8)
+    vectors = rng.normal(size=(len(xyz), 3))
+    vectors /= np.linalg.norm(vectors, axis=1)[:, None]
+    extra = {name: vectors[:, i].astype(kind) for i, name in enumerate(names)}
+    return vectors, ArrayCloud(xyz, crs, "normals", extra)
+
+
+def normals_of(path, names):
+    table = next(iter(open_any(path).table_chunks()))
+    by_lower = {name.lower(): np.asarray(values) for name, values in table.items()}
+    return np.column_stack([by_lower[name.lower()] for name in names])
+
+
+@pytest.mark.parametrize("ending", ["laz", "ply", "csv"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_normals_turn_with_the_points(tmp_path, kind, ending):
+    pair = pair_of(kind)
+    write_transform_json(tmp_path / "t.json", pair)
+    chain = read_transform(tmp_path / "t.json")
+    names = {"laz": ("NormalX", "NormalY", "NormalZ"), "ply": ("nx", "ny", "nz")}.get(
+        ending, ("Nx", "Ny", "Nz")
+    )
+    xyz, crs = file_xyz(pair.source.cloud), chain.source.file_crs
+    vectors, cloud = with_normals(xyz, crs, names)
+    write_any(tmp_path / f"in.{ending}", cloud, None, crs)
+    paths = (tmp_path / "t.json", tmp_path / f"in.{ending}", tmp_path / f"out.{ending}")
+    apply_transform(*paths, cloud_crs=None if ending == "laz" else "local" if crs is None else crs.to_wkt())
+    # where the points a metre along the normals come to
+    moved = chain.forward(xyz)
+    ahead = chain.forward(xyz + vectors / metres_of(crs, xyz))
+    expected = (ahead - moved) * metres_of(chain.target.file_crs, moved)
+    expected /= np.linalg.norm(expected, axis=1)[:, None]
+    found = normals_of(paths[2], names)
+    assert np.abs(np.linalg.norm(found, axis=1) - 1.0).max() < 1e-9
+    assert np.abs(found - expected).max() < (1e-7 if "degrees" not in kind and "out" not in kind else 1e-3)
+    back = tmp_path / f"back.{ending}"
+    apply_transform(paths[0], paths[2], back, inverse=True, cloud_crs="local")
+    assert np.abs(normals_of(back, names) - vectors).max() < 1e-9
+
+
+def test_what_is_no_direction_is_not_turned(tmp_path):
+    pair = a_pair()
+    chain = TransformChain.of(pair)
+    _, cloud = with_normals(site(), UTM, ("NormalX", "NormalY", "NormalZ"), np.int8)
+    cloud.extra |= {"nx": np.ones(600), "ny": np.ones(600), "range": np.linspace(0, 1, 600)}
+    (table,) = moved_by(chain, cloud).table_chunks()
+    for name, values in cloud.extra.items():
+        assert np.array_equal(table[name], values), name
+    write_cloud(tmp_path / "out.laz", cloud, chain.motion(), UTM)
+    assert np.array_equal(laspy.read(tmp_path / "out.laz")["NormalY"], cloud.extra["NormalY"])
+
+
+@pytest.mark.parametrize("kind", ["metres", "feet to metres", "metres to degrees"])
+def test_directions_of_waveforms_turn_with_the_points(tmp_path, kind):
+    pair = pair_of(kind)
+    chain = TransformChain.of(pair)
+    crs, xyz = chain.source.file_crs, file_xyz(pair.source.cloud)
+    header = laspy.LasHeader(version="1.4", point_format=9)
+    header.scales, header.offsets = np.full(3, 0.001), np.floor(xyz[0])
+    las = laspy.LasData(header)
+    las.xyz = xyz
+    beams = np.random.default_rng(9).normal(size=(600, 3)) * 1.5e-4
+    for i, name in enumerate(("x_t", "y_t", "z_t")):
+        las[name] = beams[:, i]
+    las.write(tmp_path / "in.las")
+    write_cloud(tmp_path / "out.las", open_cloud(tmp_path / "in.las", crs), chain.motion(), None)
+    written = laspy.read(tmp_path / "out.las")
+    found = np.column_stack([written[name] for name in ("x_t", "y_t", "z_t")])
+    far = 1e5  # picoseconds
+    expected = (chain.forward(las.xyz + far * beams) - chain.forward(las.xyz)) / far
+    assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()
