@@ -17,9 +17,9 @@ from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.io.directions import turned_columns
 from mtpcr_geo.io.foreign import append_large, restore_texts
-from mtpcr_geo.io.las import LasCloud
 from mtpcr_geo.io.layout import layout
 from mtpcr_geo.io.storage import MOST_STEPS, MisfitError, Move, Storage, settled
+from mtpcr_geo.io.views import las_below
 from mtpcr_geo.io.waveform import append_waveforms
 
 if TYPE_CHECKING:
@@ -110,6 +110,7 @@ def _write(
     advance: Callable[[int], object],
 ) -> None:
     header, chunks = layout(cloud, crs)
+    las = las_below(cloud)
     placed = _placed(header, chunks, move, storage, advance)
     try:
         if is_copc(path):
@@ -118,11 +119,11 @@ def _write(
             write_copc(path, header, placed)
         else:
             _write_las(path, header, placed)
-            if isinstance(cloud, LasCloud):
-                append_waveforms(path, cloud)
-        if isinstance(cloud, LasCloud):
-            append_large(path, cloud)
-            restore_texts(path, cloud)
+            if las is not None:
+                append_waveforms(path, las)
+        if las is not None:
+            append_large(path, las)
+            restore_texts(path, las)
     except (OSError, lazrs.LazrsError) as error:
         reason = getattr(error, "strerror", None) or error
         raise OutputError(f"cannot write in {path.parent}: {reason}; check rights and free space") from error
@@ -141,8 +142,9 @@ def returning_scales(cloud: Cloud, crs: CRS | None) -> Floats:
     the input's, within 0.00001 and 0.001 metres (or feet), as long as the cloud's extent allows it.
     """
     scales = np.full(3, STEP)
-    if isinstance(cloud, LasCloud):
-        scales = np.asarray(cloud.header.scales, np.float64) / 10
+    las = las_below(cloud)
+    if las is not None:
+        scales = np.asarray(las.header.scales, np.float64) / 10
         if cloud.crs is not None and cloud.crs.is_geographic:
             scales[:2] *= _METRES_A_DEGREE
         scales = np.clip(scales, FINEST_STEP / 10, STEP)
@@ -215,9 +217,9 @@ def scales_of(
         if np.ndim(given) == 0 and crs is not None and crs.is_geographic:
             scales[:2] /= _METRES_A_DEGREE
         return scales
-    scales = np.full(3, STEP)
-    if isinstance(cloud, LasCloud) and not (cloud.crs is not None and cloud.crs.is_geographic):
-        scales = np.clip(cloud.header.scales, FINEST_STEP, STEP)
+    scales, las = np.full(3, STEP), las_below(cloud)
+    if las is not None and not (cloud.crs is not None and cloud.crs.is_geographic):
+        scales = np.clip(las.header.scales, FINEST_STEP, STEP)
     if crs is not None and crs.is_geographic:
         scales = np.array([DEGREE_STEP, DEGREE_STEP, min(scales[2], STEP)])
     return np.asarray(scales, np.float64)
