@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mtpcr_geo.core.errors import CrsError, InputError
-from mtpcr_geo.crs.facts import leaves_heights_open, same_place
+from mtpcr_geo.crs.facts import facts_of, leaves_heights_open, same_place
 from mtpcr_geo.export.transform import read_transform
 from mtpcr_geo.io.formats import open_any
 from mtpcr_geo.io.many import ManyFiles, output_names
@@ -58,8 +58,8 @@ def apply_transform(
         inverse: go from target to source.
         overwrite: whether `out_path` may be replaced.
         progress: where to report the points written.
-        say: called with a sentence where points or dimensions were left out, or the cloud lies far from the
-            one that was registered.
+        say: called with a sentence where points or dimensions were left out, the cloud lies far from the one
+            that was registered, or states nothing of heights.
         text: layout of a cloud that is text, see `mtpcr_geo.io.formats.text_layout.TextLayout.read`.
         scale: storage step of a LAS file, in units of its CRS; metres where those are degrees.
         cloud_crs: CRS of the cloud, taken instead of what its file states; "local" if it has none.
@@ -80,9 +80,14 @@ def apply_transform(
         if os.path.exists(out_path) and os.path.isfile(read) and out_path.samefile(read):
             raise InputError(f"{out_path} is input and output at once; write to another file")
     moved = moved_by(chain, cloud, inverse=inverse, cloud_crs=cloud_crs)
-    far = far_text(chain, cloud, inverse=inverse)
-    if far is not None and say is not None:
-        say(far)
+    remarks = (
+        heights_text(chain, cloud, inverse=inverse, cloud_crs=cloud_crs),
+        far_text(chain, cloud, inverse=inverse),
+    )
+    if say is not None:
+        for remark in remarks:
+            if remark is not None:
+                say(remark)
     said = write_moved(
         out_path, moved, overwrite=overwrite, reads=(in_path, transform_path), progress=progress, scale=scale
     )
@@ -158,17 +163,43 @@ def _claimed(cloud: Cloud, given: str | CRS | None) -> CRS | None:
     return parse_crs(given) if isinstance(given, str) else given
 
 
+def heights_text(
+    chain: TransformChain, cloud: Cloud, *, inverse: bool = False, cloud_crs: str | CRS | None = None
+) -> str | None:
+    """Say what heights are taken for a cloud that states the plan of its CRS alone; None for all others.
+
+    Args:
+        chain: from the source's coordinates to the target's.
+        cloud: what is moved.
+        inverse: go from target to source.
+        cloud_crs: CRS of the cloud, taken instead of what it states.
+
+    """
+    start, crs = chain.target if inverse else chain.source, _claimed(cloud, cloud_crs)
+    if crs is None or start.file_crs is None or _is_known(chain, crs, inverse):
+        return None
+    return (
+        f"{Path(cloud.name).name} is in {crs.name}, which says nothing of heights: they are taken as "
+        f"{facts_of(start.file_crs).height_name}, as those of the {'target' if inverse else 'source'}"
+    )
+
+
 def _is_in_frame(chain: TransformChain, crs: CRS, inverse: bool) -> bool:
     """Return whether coordinates in a CRS are those from which a chain starts.
 
     They are in the CRS of its frame; or in the one that the registered file itself states, whatever was
     given for it; or in the horizontal part of that of the frame, with nothing stated of heights.
     """
-    start, stated = (chain.target, chain.target_stated) if inverse else (chain.source, chain.source_stated)
-    known = [one for one in (start.file_crs, stated) if one is not None]
-    if any(same_place(crs, one) for one in known):
+    start = chain.target if inverse else chain.source
+    if _is_known(chain, crs, inverse):
         return True
     return start.file_crs is not None and leaves_heights_open(crs, start.file_crs)
+
+
+def _is_known(chain: TransformChain, crs: CRS, inverse: bool) -> bool:
+    """Return whether a CRS is that of the frame where a chain starts, or the registered file states it."""
+    start, stated = (chain.target, chain.target_stated) if inverse else (chain.source, chain.source_stated)
+    return any(same_place(crs, one) for one in (start.file_crs, stated) if one is not None)
 
 
 def _check_near(chain: TransformChain, cloud: Cloud, inverse: bool) -> None:

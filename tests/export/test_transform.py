@@ -17,7 +17,7 @@ from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import CrsError, InputError, OutputError
 from mtpcr_geo.core.types import Pair, Side
 from mtpcr_geo.crs import TransformChain, resolve_frames
-from mtpcr_geo.export.apply import apply_transform, far_text, moved_by
+from mtpcr_geo.export.apply import apply_transform, far_text, heights_text, moved_by
 from mtpcr_geo.export.descriptions import shift_text, transform_rows
 from mtpcr_geo.export.pdal_file import write_pdal_pipeline
 from mtpcr_geo.export.prior_file import read_pose
@@ -375,6 +375,11 @@ def test_apply_takes_a_cloud_that_states_the_plan_alone(tmp_path):
     chain = TransformChain.of(pair)
     silent = ArrayCloud(site(), UTM)
     assert np.array_equal(moved_by(chain, silent).to_array(), chain.forward(site()))
+    said = heights_text(chain, silent)
+    assert said is not None
+    assert "says nothing of heights: they are taken as NAVD88 height, as those of the source" in said
+    assert heights_text(chain, ArrayCloud(site(), chain.source.file_crs)) is None
+    assert heights_text(chain, ArrayCloud(site(), None)) is None
     # heights of another kind, or in another unit, are not those of the frame
     for other in ("EPSG:2993+6360", "EPSG:2993+5702", "EPSG:2994", "EPSG:26910"):
         with pytest.raises(CrsError, match="starts from"):
