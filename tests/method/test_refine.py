@@ -265,9 +265,9 @@ def test_dense_plots_get_a_last_finer_round(monkeypatch: pytest.MonkeyPatch) -> 
 
     finely = refine_module._refined_finely
 
-    def noted(source, target, T_start, settings, agreeing):
+    def noted(source, target, T_start, settings, agreeing, T_axes):
         off_by_then.append(off(T_start))
-        return finely(source, target, T_start, settings, agreeing)
+        return finely(source, target, T_start, settings, agreeing, T_axes)
 
     monkeypatch.setattr(refine_module, "_refined_finely", noted)
     found = []
