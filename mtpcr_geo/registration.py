@@ -48,6 +48,7 @@ from mtpcr_geo.pipeline.stages.steps import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
+    from pyproj import CRS
 
     from mtpcr_geo.io.memory import CloudLike
 
@@ -349,6 +350,7 @@ def apply(
     inverse: bool = False,
     overwrite: bool = False,
     scale: float | None = None,
+    cloud_crs: str | CRS | None = None,
     progress: Progress | None = None,
 ) -> Floats | Cloud | Path:
     """Move points by the transform of a registration.
@@ -360,7 +362,8 @@ def apply(
         out: a file to write the moved cloud to, its ending the format; nothing is written if not given.
         inverse: go from target to source.
         overwrite: replace `out` if it is there.
-        scale: storage step of a LAS file, in units of its CRS.
+        scale: storage step of a LAS file, in units of its CRS; metres where those are degrees.
+        cloud_crs: CRS of a cloud, taken instead of what it states; "local" if it has none.
         progress: where to report the points written.
 
     Returns:
@@ -381,8 +384,8 @@ def apply(
     else:
         chain = transform.chain()
     if out is None:
-        return move(chain, points, inverse=inverse)
-    moved = moved_by(chain, cloud_of(points, "points"), inverse=inverse)
+        return move(chain, points, inverse=inverse, cloud_crs=cloud_crs)
+    moved = moved_by(chain, cloud_of(points, "points"), inverse=inverse, cloud_crs=cloud_crs)
     reads = [Path(one) for one in (transform, points) if isinstance(one, str | os.PathLike)]
     write_moved(Path(out), moved, overwrite=overwrite, reads=reads, progress=progress, scale=scale)
     return Path(out)

@@ -28,6 +28,7 @@ def run(options: ApplyVerb) -> None:
             inverse=options.inverse,
             text=options.text,
             scale=options.scale,
+            cloud_crs=options.cloud_crs,
             overwrite=options.overwrite,
             progress=progress,
             say=warn,

@@ -144,6 +144,14 @@ class ApplyVerb(VerbOptions):
         ),
         Shown(OUTPUT, argument=True),
     ]
+    cloud_crs: Annotated[
+        str | None,
+        Field(
+            description="CRS of the cloud, instead of what its file states, such as EPSG:25832+5783; local "
+            "for a cloud without one"
+        ),
+        Shown(INPUTS),
+    ] = None
     text: CloudText = None
     scale: Scale = None
     inverse: Annotated[

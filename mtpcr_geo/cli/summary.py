@@ -130,10 +130,9 @@ def _left_out_lines(result: Registration) -> list[str]:
 
     said = []
     for record in result.report:
-        kept = record.metadata
-        if kept.get("left_out") or kept.get("dimensions_left_out"):
-            missing = LeftOut(int(kept.get("left_out", 0)), tuple(kept.get("dimensions_left_out", ())))
-            said += missing.sentences(Path(str(kept["filename"])).name)
+        missing = LeftOut.read(record.metadata)
+        if missing != LeftOut():
+            said += missing.sentences(Path(str(record.metadata["filename"])).name)
     return said
 
 

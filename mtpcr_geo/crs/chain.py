@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,11 @@ from mtpcr_geo.core.arrays import ComparesArrays, Floats
 from mtpcr_geo.core.frames import FrameLink, box_points, fit_affine
 
 if TYPE_CHECKING:
+    from pyproj import CRS
+
     from mtpcr_geo.core.types import Pair
+
+_UNITS, _DEGREES = 10.0, 1e-4  # steps about a place, of some ten metres, over which a projection is linear
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +31,8 @@ class TransformChain(ComparesArrays):
         T_target_source: 4x4 rigid transform in work coordinates, metres.
         pivot: (3,) centroid of the source, in source file coordinates.
         bounds: (2, 3) of the source, in source file coordinates.
+        source_stated: CRS that the source's file states, or None; another one may have been given by option.
+        target_stated: likewise of the target; None where the result is in another CRS, which was asked for.
 
     """
 
@@ -34,6 +41,8 @@ class TransformChain(ComparesArrays):
     T_target_source: Floats
     pivot: Floats
     bounds: Floats
+    source_stated: CRS | None = None
+    target_stated: CRS | None = None
 
     @classmethod
     def of(cls, pair: Pair) -> TransformChain:
@@ -56,6 +65,8 @@ class TransformChain(ComparesArrays):
             bounds=np.stack([cloud.minimum, cloud.maximum]).astype(np.float64)
             if pair.source.bounds is None
             else pair.source.bounds,
+            source_stated=cloud.crs,
+            target_stated=None if pair.frame.output is not None else pair.target.cloud.crs,
         )
 
     def forward(self, xyz: Floats) -> Floats:
@@ -74,6 +85,10 @@ class TransformChain(ComparesArrays):
             lambda some: self.source.to_file(transforms.apply(T_source_target, self.target.to_work(some))),
             xyz,
         )
+
+    def motion(self, inverse: bool = False) -> Motion:
+        """Return the chain as a move of points, forward or inverse, that tells how vectors turn with them."""
+        return Motion(self, inverse)
 
     def _moved(self, move: Callable[[Floats], Floats], xyz: Floats) -> Floats:
         # PROJ takes its time to begin
@@ -128,3 +143,59 @@ class TransformChain(ComparesArrays):
     def rotation_in_files(self) -> Floats:
         """(3, 3) linear part of the 4x4, which turns about `pivot` without any far origin in the sums."""
         return self.T_file[:3, :3]
+
+
+class Motion:
+    """A move of points by a chain; vectors that points carry turn as the place of the pivot does.
+
+    Args:
+        chain: from source to target.
+        inverse: go from target to source.
+
+    """
+
+    def __init__(self, chain: TransformChain, inverse: bool = False) -> None:
+        self.chain, self.inverse = chain, inverse
+
+    def __call__(self, xyz: Floats) -> Floats:
+        """Take (n, 3) file coordinates of one side to (n, 3) of the other."""
+        return self.chain.inverse(xyz) if self.inverse else self.chain.forward(xyz)
+
+    @cached_property
+    def rotation(self) -> Floats:
+        """(3, 3) for vectors of metric length along the axes of the files, such as normals."""
+        source, target = (_nearest_rotation(linear) for linear in self._linear_parts)
+        R = target.T @ self.chain.T_target_source[:3, :3] @ source
+        return np.asarray(R.T if self.inverse else R)
+
+    @cached_property
+    def linear(self) -> Floats:
+        """(3, 3) for vectors in units of the files' coordinates."""
+        source, target = self._linear_parts
+        A = np.linalg.solve(target, self.chain.T_target_source[:3, :3] @ source)
+        return np.asarray(np.linalg.inv(A) if self.inverse else A)
+
+    @cached_property
+    def _linear_parts(self) -> tuple[Floats, Floats]:
+        """From file to work coordinates, at the pivot, of source and target."""
+        pivot = self.chain.pivot
+        return (
+            _linear_part(self.chain.source, pivot),
+            _linear_part(self.chain.target, self.chain.forward(pivot[None])[0]),
+        )
+
+
+def _linear_part(link: FrameLink, at: Floats) -> Floats:
+    """Return the (3, 3) linear part from file to work coordinates, about a point (3,) of the file."""
+    if link.pipeline is None:
+        return link.T_work_file[:3, :3]
+    degrees = link.file_crs is not None and link.file_crs.is_geographic
+    steps = np.diag([_DEGREES, _DEGREES, _UNITS] if degrees else [_UNITS] * 3)
+    ends = link.to_work(np.concatenate([at + steps, at - steps]))
+    return np.asarray((ends[:3] - ends[3:]).T / (2 * np.diag(steps)))
+
+
+def _nearest_rotation(linear: Floats) -> Floats:
+    """Return the rotation next to a (3, 3) linear part, whatever the units of its axes."""
+    u, _, vt = np.linalg.svd(linear / np.linalg.norm(linear, axis=0))
+    return np.asarray(u @ vt)

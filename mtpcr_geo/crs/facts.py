@@ -192,6 +192,25 @@ def same_place(one: CRS, other: CRS) -> bool:
         return False
 
 
+def leaves_heights_open(one: CRS, whole: CRS) -> bool:
+    """Return whether a CRS is the horizontal part of another one, and states nothing of heights.
+
+    Args:
+        one: it.
+        whole: a CRS with a vertical part, or with ellipsoidal heights.
+
+    """
+    try:
+        facts, other = facts_of(one), facts_of(whole)
+    except CrsError:
+        return False
+    if facts.horizontal is None or other.horizontal is None or facts.height != "unsaid":
+        return False
+    if facts.height_unit_stated and abs(facts.height_unit / other.height_unit - 1.0) > 1e-9:
+        return False
+    return facts.kind == other.kind and same_place(facts.horizontal, other.horizontal)
+
+
 def same_heights(one: CrsFacts, other: CrsFacts) -> bool:
     """Return whether two CRSs count heights from the same surface, whatever their units."""
     if one.height != other.height:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mtpcr_geo.core.errors import CrsError, InputError
-from mtpcr_geo.crs.facts import same_place
+from mtpcr_geo.crs.facts import facts_of, leaves_heights_open, same_place
 from mtpcr_geo.export.transform import read_transform
 from mtpcr_geo.io.formats import open_any
 from mtpcr_geo.io.many import ManyFiles, output_names
@@ -20,6 +20,8 @@ from mtpcr_geo.io.views import Moved
 from mtpcr_geo.io.write_any import ENDINGS, check_ending, write_any
 
 if TYPE_CHECKING:
+    from pyproj import CRS
+
     from mtpcr_geo.core.arrays import Floats
     from mtpcr_geo.core.cloud import Cloud
     from mtpcr_geo.core.progress import Progress
@@ -42,6 +44,7 @@ def apply_transform(
     say: Callable[[str], object] | None = None,
     text: str | None = None,
     scale: float | None = None,
+    cloud_crs: str | None = None,
 ) -> Path:
     """Stream a cloud through a transform into a new file of any format that is written.
 
@@ -55,10 +58,11 @@ def apply_transform(
         inverse: go from target to source.
         overwrite: whether `out_path` may be replaced.
         progress: where to report the points written.
-        say: called with a sentence where points or dimensions were left out, or the cloud lies far from the
-            one that was registered.
+        say: called with a sentence where points or dimensions were left out, the cloud lies far from the one
+            that was registered, or states nothing of heights.
         text: layout of a cloud that is text, see `mtpcr_geo.io.formats.text_layout.TextLayout.read`.
-        scale: storage step of a LAS file, in units of its CRS.
+        scale: storage step of a LAS file, in units of its CRS; metres where those are degrees.
+        cloud_crs: CRS of the cloud, taken instead of what its file states; "local" if it has none.
 
     Returns:
         The file written.
@@ -75,10 +79,15 @@ def apply_transform(
     for read in (cloud.path, Path(in_path), Path(transform_path)):
         if os.path.exists(out_path) and os.path.isfile(read) and out_path.samefile(read):
             raise InputError(f"{out_path} is input and output at once; write to another file")
-    moved = moved_by(chain, cloud, inverse=inverse)
-    far = far_text(chain, cloud, inverse=inverse)
-    if far is not None and say is not None:
-        say(far)
+    moved = moved_by(chain, cloud, inverse=inverse, cloud_crs=cloud_crs)
+    remarks = (
+        heights_text(chain, cloud, inverse=inverse, cloud_crs=cloud_crs),
+        far_text(chain, cloud, inverse=inverse),
+    )
+    if say is not None:
+        for remark in remarks:
+            if remark is not None:
+                say(remark)
     said = write_moved(
         out_path, moved, overwrite=overwrite, reads=(in_path, transform_path), progress=progress, scale=scale
     )
@@ -88,7 +97,9 @@ def apply_transform(
     return out_path
 
 
-def move(chain: TransformChain, points: CloudLike, *, inverse: bool = False) -> Floats | Cloud:
+def move(
+    chain: TransformChain, points: CloudLike, *, inverse: bool = False, cloud_crs: str | CRS | None = None
+) -> Floats | Cloud:
     """Move points by the chain of a registration: an array at once, a cloud as its points are read.
 
     Args:
@@ -96,6 +107,7 @@ def move(chain: TransformChain, points: CloudLike, *, inverse: bool = False) -> 
         points: (n, 3) coordinates in the source's CRS and units (in the target's with `inverse`); or a file,
             `laspy.LasData` or `Cloud`.
         inverse: go from target to source.
+        cloud_crs: CRS of a cloud, taken instead of what it states; "local" if it has none.
 
     Returns:
         (n, 3) float64 for an array, else a cloud with all dimensions.
@@ -108,16 +120,20 @@ def move(chain: TransformChain, points: CloudLike, *, inverse: bool = False) -> 
     if is_array(points):
         xyz = coordinates(points, "points")
         return chain.inverse(xyz) if inverse else chain.forward(xyz)
-    return moved_by(chain, cloud_of(points, "points"), inverse=inverse)
+    return moved_by(chain, cloud_of(points, "points"), inverse=inverse, cloud_crs=cloud_crs)
 
 
-def moved_by(chain: TransformChain, cloud: Cloud, *, inverse: bool = False) -> Moved:
+def moved_by(
+    chain: TransformChain, cloud: Cloud, *, inverse: bool = False, cloud_crs: str | CRS | None = None
+) -> Moved:
     """Return a cloud moved by the chain of a registration; its points are moved as they are read.
 
     Args:
         chain: from the source's coordinates to the target's.
-        cloud: in the source's frame (in the target's with `inverse`).
+        cloud: in the source's frame (in the target's with `inverse`). One that states the same horizontal
+            system and nothing of heights is taken to have the heights of that frame.
         inverse: go from target to source.
+        cloud_crs: CRS of the cloud, taken instead of what it states; "local" if it has none.
 
     Raises:
         CrsError: if the cloud is not in the frame from which the transform starts, or states no CRS and lies
@@ -125,14 +141,65 @@ def moved_by(chain: TransformChain, cloud: Cloud, *, inverse: bool = False) -> M
 
     """
     start, end = (chain.target, chain.source) if inverse else (chain.source, chain.target)
-    if cloud.crs is not None and start.file_crs is not None and not same_place(cloud.crs, start.file_crs):
+    crs = _claimed(cloud, cloud_crs)
+    if crs is not None and start.file_crs is not None and not _is_in_frame(chain, crs, inverse):
         side = "target" if inverse else "source"
         raise CrsError(
-            f"{cloud.name} is in {cloud.crs.name}, and the transform starts from its {side}'s "
-            f"{start.file_crs.name}; reproject the cloud first, or check whether --inverse is meant"
+            f"{cloud.name} is in {crs.name}, and the transform starts from its {side}'s "
+            f"{start.file_crs.name}; reproject the cloud first, give --cloud-crs if it "
+            "is in another system than it states, or check whether --inverse is meant"
         )
-    _check_near(chain, cloud, inverse)
-    return Moved(cloud, chain.inverse if inverse else chain.forward, end.file_crs)
+    if crs is None:
+        _check_near(chain, cloud, inverse)
+    return Moved(cloud, chain.motion(inverse), end.file_crs)
+
+
+def _claimed(cloud: Cloud, given: str | CRS | None) -> CRS | None:
+    """Return the CRS of a cloud: the one given, else the one stated; None for local coordinates."""
+    from mtpcr_geo.crs import parse_crs
+
+    if given is None:
+        return cloud.crs
+    return parse_crs(given) if isinstance(given, str) else given
+
+
+def heights_text(
+    chain: TransformChain, cloud: Cloud, *, inverse: bool = False, cloud_crs: str | CRS | None = None
+) -> str | None:
+    """Say what heights are taken for a cloud that states the plan of its CRS alone; None for all others.
+
+    Args:
+        chain: from the source's coordinates to the target's.
+        cloud: what is moved.
+        inverse: go from target to source.
+        cloud_crs: CRS of the cloud, taken instead of what it states.
+
+    """
+    start, crs = chain.target if inverse else chain.source, _claimed(cloud, cloud_crs)
+    if crs is None or start.file_crs is None or _is_known(chain, crs, inverse):
+        return None
+    return (
+        f"{Path(cloud.name).name} is in {crs.name}, which says nothing of heights: they are taken as "
+        f"{facts_of(start.file_crs).height_name}, as those of the {'target' if inverse else 'source'}"
+    )
+
+
+def _is_in_frame(chain: TransformChain, crs: CRS, inverse: bool) -> bool:
+    """Return whether coordinates in a CRS are those from which a chain starts.
+
+    They are in the CRS of its frame; or in the one that the registered file itself states, whatever was
+    given for it; or in the horizontal part of that of the frame, with nothing stated of heights.
+    """
+    start = chain.target if inverse else chain.source
+    if _is_known(chain, crs, inverse):
+        return True
+    return start.file_crs is not None and leaves_heights_open(crs, start.file_crs)
+
+
+def _is_known(chain: TransformChain, crs: CRS, inverse: bool) -> bool:
+    """Return whether a CRS is that of the frame where a chain starts, or the registered file states it."""
+    start, stated = (chain.target, chain.target_stated) if inverse else (chain.source, chain.source_stated)
+    return any(same_place(crs, one) for one in (start.file_crs, stated) if one is not None)
 
 
 def _check_near(chain: TransformChain, cloud: Cloud, inverse: bool) -> None:
@@ -142,8 +209,6 @@ def _check_near(chain: TransformChain, cloud: Cloud, inverse: bool) -> None:
         CrsError: if it is farther away than many times the extent of that one.
 
     """
-    if cloud.crs is not None:
-        return
     away = _extents_away(chain, cloud, inverse)
     if away is not None and away > _FAR:
         side = "target" if inverse else "source"
@@ -215,7 +280,7 @@ def write_moved(
         overwrite: whether `out_path` may be replaced.
         reads: files that are read, and never replaced.
         progress: where to report the points written.
-        scale: storage step of a LAS file, in units of its CRS.
+        scale: storage step of a LAS file, in units of its CRS; metres where those are degrees.
 
     Returns:
         What was left out, a sentence for each file and kind.

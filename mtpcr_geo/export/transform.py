@@ -86,8 +86,8 @@ def write_transform_json(path: str | Path, pair: Pair, *, forced: bool = False) 
             "T_source_target": chain.T_source_target,
         },
         "chain": {
-            "source": _link(chain.source),
-            "target": _link(chain.target),
+            "source": {**_link(chain.source), "stated_crs": _crs(chain.source_stated)},
+            "target": {**_link(chain.target), "stated_crs": _crs(chain.target_stated)},
             "source_bounds": chain.bounds,
         },
         "example": {
@@ -149,6 +149,9 @@ def read_transform(path: str | Path) -> TransformChain:
             T_target_source=_array(document["work"]["T_target_source"], (4, 4)),
             pivot=_array(document["pivot"]["source"], (3,)),
             bounds=_array(chain["source_bounds"], (2, 3)),
+            # older files do not have them
+            source_stated=_read_crs(chain["source"].get("stated_crs")),
+            target_stated=_read_crs(chain["target"].get("stated_crs")),
         )
         _check_rigid(result.T_target_source)
     except (KeyError, TypeError, ValueError, OverflowError, IndexError) as error:
@@ -322,16 +325,20 @@ FACTOR_LIMIT, ORIGIN_LIMIT = 1e9, 1e15
 """Metres a unit, or units a metre, and coordinates beyond which a transform file is damaged."""
 
 
-def _read_link(data: Mapping[str, Any]) -> FrameLink:
+def _read_crs(data: Mapping[str, Any] | None) -> CRS | None:
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
-    crs = None
-    if data["crs"] is not None:
-        try:
-            crs = CRS.from_wkt(data["crs"]["wkt"])
-        except CRSError as error:
-            raise ValueError(f"its CRS cannot be read ({error})") from error
+    if data is None:
+        return None
+    try:
+        return CRS.from_wkt(data["wkt"])
+    except CRSError as error:
+        raise ValueError(f"its CRS cannot be read ({error})") from error
+
+
+def _read_link(data: Mapping[str, Any]) -> FrameLink:
+    crs = _read_crs(data["crs"])
     pipeline = data["pipeline"]
     if pipeline is not None and not isinstance(pipeline, str):
         raise TypeError("pipeline is not text")

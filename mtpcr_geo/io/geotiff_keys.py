@@ -118,7 +118,9 @@ def _with_heights(crs: CRS, codes: dict[int, int]) -> tuple[CRS, str]:
         return crs, f"its vertical GeoTIFF key {code} means heights above an ellipsoid that is not its CRS's"
     vertical = _vertical_system(code, datum, unit)
     if vertical is not None:
-        return CompoundCRS(f"{crs.name} + {vertical.name}", components=[crs, vertical]), ""
+        return CompoundCRS(f"{crs.name} + {vertical.name}", components=[crs, vertical]), _contradiction(
+            code, datum, unit
+        )
     named = [f"{value}" for value in (code, datum) if _is_code(value)]
     problem = (
         f"its vertical GeoTIFF keys ({', '.join(named)}) name no vertical system: the datum of its heights "
@@ -144,14 +146,69 @@ def _vertical_system(code: int, datum: int, unit: float | None) -> CRS | None:
     """
     system = _epsg_vertical(code)
     if system is not None:
-        return system
+        return _in_unit(system, unit)
     name = _epsg_vertical_datum(code) or ("" if _is_code(code) else _epsg_vertical_datum(datum))
     other = _epsg_vertical(datum)
     if other is not None and (
         not _is_code(code) or (name and other.datum is not None and _same(other.datum.name, name))
     ):
-        return other  # both keys exchanged, or the system under the datum's key
+        return _in_unit(other, unit)  # both keys exchanged, or the system under the datum's key
     return _vertical_of(f"{name} height", name, 1.0 if unit is None else unit) if name else None
+
+
+def _in_unit(system: CRS, unit: float | None) -> CRS:
+    """Return a vertical CRS of EPSG in the unit that the keys state beside its code.
+
+    Codes of systems in metres are often written for heights in feet, and the unit key is what tells them
+    apart: the heights are in the unit that is stated.
+
+    Args:
+        system: the one that the code names.
+        unit: metres a unit of height, None where no key states it.
+
+    Returns:
+        The system itself if that is its unit; else EPSG's of the same datum in the unit, or one built so.
+
+    """
+    from pyproj import CRS
+    from pyproj.database import query_crs_info
+    from pyproj.enums import PJType
+
+    if not _differs(system, unit) or unit is None or system.datum is None:
+        return system
+    plain = _plain_name(system.name)
+    for info in query_crs_info(auth_name="EPSG", pj_types=PJType.VERTICAL_CRS):
+        if _plain_name(info.name) == plain:
+            other = CRS.from_epsg(int(info.code))
+            same_datum = other.datum is not None and _same(other.datum.name, system.datum.name)
+            if same_datum and other.axis_info[0].direction == "up" and not _differs(other, unit):
+                return other
+    return _vertical_of(f"{plain} ({_name(unit)})", system.datum.name, unit)
+
+
+def _contradiction(code: int, datum: int, unit: float | None) -> str:
+    """Return a remark if the keys state another unit of height than that of the system they name, or ""."""
+    for value in (code, datum):
+        system = _epsg_vertical(value)
+        if system is None:
+            continue
+        if unit is None or not _differs(system, unit):
+            return ""
+        own = system.axis_info[0].unit_name
+        return (
+            f"its vertical GeoTIFF keys name EPSG:{value} ({system.name}), which is in {own}, and state "
+            f"heights in {_name(unit)}, which is taken"
+        )
+    return ""
+
+
+def _differs(system: CRS, unit: float | None) -> bool:
+    return unit is not None and abs(system.axis_info[0].unit_conversion_factor - unit) > 1e-9
+
+
+def _plain_name(name: str) -> str:
+    """Return the name of a vertical system without its unit: "NAVD88 height" of "NAVD88 height (ftUS)"."""
+    return name.partition(" (")[0]
 
 
 def _rests_on(crs: CRS, code: int) -> bool:
@@ -220,7 +277,7 @@ def _unit(code: int) -> float | None:
 
 
 def _name(unit: float) -> str:
-    return {0.3048: "foot", 1200 / 3937: "US survey foot"}.get(unit, f"unit of {unit:.9g} m")
+    return {1.0: "metre", 0.3048: "foot", 1200 / 3937: "US survey foot"}.get(unit, f"unit of {unit:.9g} m")
 
 
 def _same(one: str, other: str) -> bool:

@@ -19,6 +19,7 @@ from mtpcr_geo.core.version import __version__
 from mtpcr_geo.io.dimensions import LEGACY_OVERLAP, PDAL_NAMES, SCAN_ANGLE_STEP
 from mtpcr_geo.io.foreign import as_vlr
 from mtpcr_geo.io.las import LasCloud, xyz_of
+from mtpcr_geo.io.views import las_below, las_records
 from mtpcr_geo.io.vlr import EXTRA_BYTES, WKT_RECORD, Record
 
 if TYPE_CHECKING:
@@ -50,7 +51,8 @@ def layout(cloud: Cloud, crs: CRS | None) -> tuple[laspy.LasHeader, Iterator[Chu
     """Return how a cloud is written, and its points in that layout.
 
     Args:
-        cloud: any cloud; a `LasCloud` keeps its dimensions, extra bytes, identifiers and records.
+        cloud: any cloud; a `LasCloud`, and a view of one, keeps dimensions, extra bytes, identifiers and
+            records.
         crs: what to state as WKT; None states nothing.
 
     Returns:
@@ -61,8 +63,9 @@ def layout(cloud: Cloud, crs: CRS | None) -> tuple[laspy.LasHeader, Iterator[Chu
         InputError: if the cloud has no points, or dimensions or classes that a LAS file cannot hold.
 
     """
-    if isinstance(cloud, LasCloud):
-        header, chunks = _las_layout(cloud)
+    las = las_below(cloud)
+    if las is not None and (cloud.count or cloud is las):
+        header, chunks = _las_layout(las, cloud)
     else:
         header, chunks = _table_layout(cloud)
     header.global_encoding.wkt = True
@@ -92,7 +95,8 @@ def wkt_of(crs: CRS) -> str:
     return str(crs.to_wkt("WKT2_2019"))
 
 
-def _las_layout(cloud: LasCloud) -> tuple[laspy.LasHeader, Iterator[Chunk]]:
+def _las_layout(cloud: LasCloud, shown: Cloud) -> tuple[laspy.LasHeader, Iterator[Chunk]]:
+    """Return the layout of a LAS file, and what a cloud shows of its points."""
     old = cloud.header
     point_format = laspy.PointFormat(MODERN_FORMAT.get(old.point_format.id, old.point_format.id))
     header = laspy.LasHeader(version="1.4", point_format=point_format)
@@ -112,7 +116,7 @@ def _las_layout(cloud: LasCloud) -> tuple[laspy.LasHeader, Iterator[Chunk]]:
             vlr = as_vlr(record, number)
             (header.vlrs if len(record.data) <= _MAX_VLR else header.evlrs).append(vlr)
     dtype = point_format.dtype()
-    return header, ((xyz_of(record), modern(record, dtype)) for record in cloud.record_chunks())
+    return header, ((xyz_of(record), modern(record, dtype)) for record in las_records(shown))
 
 
 def modern(record: Any, dtype: np.dtype[Any]) -> NDArray[Any]:

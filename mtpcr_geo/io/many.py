@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -61,15 +62,40 @@ class ManyFiles(FileCloud):
             part.keep(until)
 
     def table_chunks(self, size: int = CHUNK_POINTS) -> Iterator[PointTable]:
-        """Yield tables of the dimensions that all files have, n <= size rows each."""
-        common: set[str] | None = None
-        for part in self.parts:
-            first = next(iter(part.table_chunks(1)), None)
-            names = set(first or ())
-            common = names if common is None else common & names
+        """Yield tables of the dimensions that all files with points have, n <= size rows each."""
         for part in self.parts:
             for table in part.table_chunks(size):
-                yield {name: values for name, values in table.items() if name in (common or ())}
+                if len(table["X"]):
+                    yield {name: table[name] for name in self._names[0]}
+
+    @property
+    def uncommon(self) -> tuple[str, ...]:
+        """The dimensions by PDAL name that some of the files have and others have not, left out of tables."""
+        return self._names[1]
+
+    @cached_property
+    def _names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The dimensions that all files with points have, in the order of the first, and the others."""
+        firsts = (next(iter(part.table_chunks(1)), None) for part in self.parts)
+        rows = [list(first) for first in firsts if first is not None and len(first["X"])]
+        every = dict.fromkeys(name for names in rows for name in names)
+        common = tuple(name for name in every if all(name in names for names in rows))
+        return common, tuple(name for name in every if name not in common)
+
+
+def uncommon_of(cloud: Cloud) -> tuple[str, ...]:
+    """Return the dimensions by PDAL name that a cloud lacks since not all files that it comes from have them.
+
+    Args:
+        cloud: any; what is seen through a view, or moved, is looked for below it.
+
+    """
+    while not isinstance(cloud, ManyFiles):
+        base = getattr(cloud, "base", None)
+        if not isinstance(base, Cloud):
+            return ()
+        cloud = base
+    return cloud.uncommon
 
 
 def _refilled(rows: Iterator[tuple[np.ndarray, ...]], size: int) -> Iterator[tuple[np.ndarray, ...]]:

@@ -14,8 +14,12 @@ from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 from mtpcr_geo.core.errors import CrsError
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.crs import TransformChain
+from mtpcr_geo.io.directions import turned_columns
+from mtpcr_geo.io.las import LasCloud
+from mtpcr_geo.io.las import xyz_of as placed_xyz
 
 if TYPE_CHECKING:
+    import laspy
     from pyproj import CRS
 
 Floats = NDArray[np.float64]
@@ -68,7 +72,7 @@ class View(Cloud):
 
     def xyz_chunks(self, size: int = CHUNK_POINTS) -> Iterator[Floats]:
         """Yield (n, 3) float64 coordinates in the cloud's own CRS and units, n <= size."""
-        for xyz, keep in self._masked((xyz, xyz) for xyz in self.base.xyz_chunks(size)):
+        for xyz, keep in self.masked((xyz, xyz) for xyz in self.base.xyz_chunks(size)):
             if keep.any():
                 yield xyz[keep]
 
@@ -77,14 +81,14 @@ class View(Cloud):
         pairs: Iterator[tuple[PointTable, Floats]] = (
             (table, xyz_of(table)) for table in self.base.table_chunks(size)
         )
-        for table, keep in self._masked(pairs):
+        for table, keep in self.masked(pairs):
             if keep.any():
                 yield {name: values[keep] for name, values in table.items()}
 
     def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, NDArray[np.bool_]]]:
         """Yield coordinates (n, 3) and which of them are noise or withheld (n,), n <= size."""
         chunks = (((xyz, noise), xyz) for xyz, noise in self.base.noise_chunks(size))
-        for (xyz, noise), keep in self._masked(chunks):
+        for (xyz, noise), keep in self.masked(chunks):
             if keep.any():
                 yield xyz[keep], noise[keep]
 
@@ -92,8 +96,36 @@ class View(Cloud):
         """Let the first pass over all coordinates of the base keep them in a temporary file."""
         self.base.keep(until)
 
-    def _masked(self, chunks: Iterable[tuple[Any, Floats]]) -> Iterator[tuple[Any, NDArray[np.bool_]]]:
+    def masked(self, chunks: Iterable[tuple[Any, Floats]]) -> Iterator[tuple[Any, NDArray[np.bool_]]]:
+        """Yield of chunks, given with their (n, 3) coordinates, which of their points are shown, (n,)."""
         raise NotImplementedError
+
+
+def las_below(cloud: Cloud) -> LasCloud | None:
+    """Return the LAS file of which a cloud shows points as they are stored; None if there is none."""
+    while isinstance(cloud, View):
+        cloud = cloud.base
+    return cloud if isinstance(cloud, LasCloud) else None
+
+
+def las_records(cloud: Cloud, size: int = CHUNK_POINTS) -> Iterator[laspy.ScaleAwarePointRecord]:
+    """Yield laspy point records of what a cloud shows of a LAS file, with every dimension as stored.
+
+    Args:
+        cloud: one for which `las_below` finds a file.
+        size: points a chunk, at most.
+
+    Raises:
+        InputError: if the file is truncated or damaged.
+
+    """
+    if isinstance(cloud, LasCloud):
+        yield from cloud.record_chunks(size)
+    elif isinstance(cloud, View):
+        records = las_records(cloud.base, size)
+        for record, keep in cloud.masked((one, placed_xyz(one)) for one in records):
+            if keep.any():
+                yield record if keep.all() else record[keep]
 
 
 class Cropped(View):
@@ -104,7 +136,8 @@ class Cropped(View):
         self.outside = outside
         super().__init__(base)
 
-    def _masked(self, chunks: Iterable[tuple[Any, Floats]]) -> Iterator[tuple[Any, NDArray[np.bool_]]]:
+    def masked(self, chunks: Iterable[tuple[Any, Floats]]) -> Iterator[tuple[Any, NDArray[np.bool_]]]:
+        """Yield of chunks, given with their (n, 3) coordinates, which of their points are shown, (n,)."""
         for chunk, xyz in chunks:
             keep = np.zeros(len(xyz), bool)
             for box in self.boxes:
@@ -122,7 +155,8 @@ class Head(View):
         self.first = first
         super().__init__(base)
 
-    def _masked(self, chunks: Iterable[tuple[Any, Floats]]) -> Iterator[tuple[Any, NDArray[np.bool_]]]:
+    def masked(self, chunks: Iterable[tuple[Any, Floats]]) -> Iterator[tuple[Any, NDArray[np.bool_]]]:
+        """Yield of chunks, given with their (n, 3) coordinates, which of their points are shown, (n,)."""
         left = self.first
         for chunk, xyz in chunks:
             yield chunk, np.arange(len(xyz)) < left
@@ -138,7 +172,7 @@ class Moved(Cloud):
 
     Args:
         base: the cloud as it stands.
-        move: takes (n, 3) coordinates of `base` to the new ones.
+        move: takes (n, 3) coordinates of `base` to the new ones; by a `Motion` normals turn with the points.
         crs: CRS of the new coordinates, or None for local ones.
 
     """
@@ -185,7 +219,7 @@ class Moved(Cloud):
         for table in self.base.table_chunks(size):
             xyz = self._moved(xyz_of(table))
             moved: PointTable = {axis: xyz[:, i] for i, axis in enumerate("XYZ")}
-            yield {**table, **moved}
+            yield {**table, **turned_columns(table, self.move), **moved}
 
     def noise_chunks(self, size: int = CHUNK_POINTS) -> Iterator[tuple[Floats, NDArray[np.bool_]]]:
         """Yield moved coordinates (n, 3) and which of them are noise or withheld (n,), n <= size."""
@@ -203,4 +237,4 @@ def moved_source(pair: Pair) -> Moved:
 
     """
     chain = TransformChain.of(pair)
-    return Moved(pair.source.cloud, chain.forward, chain.target.file_crs)
+    return Moved(pair.source.cloud, chain.motion(), chain.target.file_crs)

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import OutputError
+from mtpcr_geo.io.directions import turned_columns
 from mtpcr_geo.io.foreign import append_large, restore_texts
-from mtpcr_geo.io.las import LasCloud
 from mtpcr_geo.io.layout import layout
 from mtpcr_geo.io.storage import MOST_STEPS, MisfitError, Move, Storage, settled
+from mtpcr_geo.io.views import las_below
 from mtpcr_geo.io.waveform import append_waveforms
 
 if TYPE_CHECKING:
@@ -55,10 +56,12 @@ def write_cloud(
     Args:
         path: where to write; ``.las``, ``.laz`` or ``.copc.laz`` is the format.
         cloud: what to write.
-        move: takes (n, 3) file coordinates of `cloud` to those to be written; None leaves them.
+        move: takes (n, 3) file coordinates of `cloud` to those to be written; None leaves them. By a `Motion`
+            normals and directions of waveforms turn with the points.
         crs: CRS of the written coordinates; None states none.
-        scale: storage step of coordinates, in units of `crs`; None takes 0.001, or the input's own if that is
-            finer, down to 0.0001. For geographic coordinates 1e-9 degrees.
+        scale: storage step of coordinates, in units of `crs`, or in metres where those are degrees; a tuple
+            is in units of each axis, degrees too. None takes 0.001, or the input's own if that is finer, down
+            to 0.0001. For geographic coordinates 1e-9 degrees.
         progress: where to report the points written.
         advance: called with the number of points of each chunk written.
         returning: choose a scale so fine that the cloud can be moved back onto its coordinates.
@@ -107,6 +110,7 @@ def _write(
     advance: Callable[[int], object],
 ) -> None:
     header, chunks = layout(cloud, crs)
+    las = las_below(cloud)
     placed = _placed(header, chunks, move, storage, advance)
     try:
         if is_copc(path):
@@ -115,11 +119,11 @@ def _write(
             write_copc(path, header, placed)
         else:
             _write_las(path, header, placed)
-            if isinstance(cloud, LasCloud):
-                append_waveforms(path, cloud)
-        if isinstance(cloud, LasCloud):
-            append_large(path, cloud)
-            restore_texts(path, cloud)
+            if las is not None:
+                append_waveforms(path, las)
+        if las is not None:
+            append_large(path, las)
+            restore_texts(path, las)
     except (OSError, lazrs.LazrsError) as error:
         reason = getattr(error, "strerror", None) or error
         raise OutputError(f"cannot write in {path.parent}: {reason}; check rights and free space") from error
@@ -138,8 +142,9 @@ def returning_scales(cloud: Cloud, crs: CRS | None) -> Floats:
     the input's, within 0.00001 and 0.001 metres (or feet), as long as the cloud's extent allows it.
     """
     scales = np.full(3, STEP)
-    if isinstance(cloud, LasCloud):
-        scales = np.asarray(cloud.header.scales, np.float64) / 10
+    las = las_below(cloud)
+    if las is not None:
+        scales = np.asarray(las.header.scales, np.float64) / 10
         if cloud.crs is not None and cloud.crs.is_geographic:
             scales[:2] *= _METRES_A_DEGREE
         scales = np.clip(scales, FINEST_STEP / 10, STEP)
@@ -203,14 +208,18 @@ def scales_of(
     Args:
         cloud: what is written.
         crs: of the written coordinates.
-        given: scales asked for.
+        given: scale asked for: a length, which in geographic coordinates is turned to degrees; or one for
+            each axis in its own unit.
 
     """
     if given is not None:
-        return np.broadcast_to(np.asarray(given, np.float64), 3).copy()
-    scales = np.full(3, STEP)
-    if isinstance(cloud, LasCloud) and not (cloud.crs is not None and cloud.crs.is_geographic):
-        scales = np.clip(cloud.header.scales, FINEST_STEP, STEP)
+        scales = np.broadcast_to(np.asarray(given, np.float64), 3).copy()
+        if np.ndim(given) == 0 and crs is not None and crs.is_geographic:
+            scales[:2] /= _METRES_A_DEGREE
+        return scales
+    scales, las = np.full(3, STEP), las_below(cloud)
+    if las is not None and not (cloud.crs is not None and cloud.crs.is_geographic):
+        scales = np.clip(las.header.scales, FINEST_STEP, STEP)
     if crs is not None and crs.is_geographic:
         scales = np.array([DEGREE_STEP, DEGREE_STEP, min(scales[2], STEP)])
     return np.asarray(scales, np.float64)
@@ -243,6 +252,8 @@ def _placed(
                 np.subtract(moved[:, axis], offsets[axis], out=of_axis)
                 of_axis /= storage.scales[axis]
                 np.rint(of_axis, out=of_axis)
+        for name, vectors in turned_columns(packed, move).items():
+            packed[name] = vectors
         # a NaN makes it one
         worst = float(np.maximum(steps.max(), -steps.min()))
         kept = packed

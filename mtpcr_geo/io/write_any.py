@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.io.formats import LAS_ENDINGS
 from mtpcr_geo.io.formats.writing import WRITERS, write_other
+from mtpcr_geo.io.many import uncommon_of
 from mtpcr_geo.io.storage import Move
 from mtpcr_geo.io.write import write_cloud
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
     from mtpcr_geo.core.progress import Progress
 
+_LISTS = ("dimensions_left_out", "dimensions_not_in_all_files")
 ENDINGS = (*LAS_ENDINGS, *WRITERS)
 
 
@@ -30,11 +32,27 @@ class LeftOut:
     Attributes:
         points: number of points too far from all others to be stored with them.
         dimensions: names of dimensions that the format has no place for.
+        uncommon: names of dimensions that only some of the files have which the cloud comes from.
 
     """
 
     points: int = 0
     dimensions: tuple[str, ...] = ()
+    uncommon: tuple[str, ...] = ()
+
+    @classmethod
+    def read(cls, facts: Mapping[str, Any]) -> LeftOut:
+        """Return what a stage states by the names of `as_dict`."""
+        dimensions, uncommon = (tuple(facts.get(name, ())) for name in _LISTS)
+        return cls(int(facts.get("left_out", 0)), dimensions, uncommon)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what there is of it, for the metadata of a stage."""
+        facts = {
+            "left_out": self.points,
+            **dict(zip(_LISTS, map(list, (self.dimensions, self.uncommon)), strict=True)),
+        }
+        return {name: value for name, value in facts.items() if value}
 
     def sentences(self, name: str) -> list[str]:
         """Return what was left out of a file of that name, a sentence each."""
@@ -44,6 +62,10 @@ class LeftOut:
             said.append(f"{points} left out of {name}: too far from all others to be stored with them")
         if self.dimensions:
             said.append(f"{name} has no place for {', '.join(self.dimensions)}: left out")
+        if self.uncommon:
+            said.append(
+                f"{', '.join(self.uncommon)} left out of {name}: not all of the files joined have them"
+            )
         return said
 
 
@@ -84,7 +106,8 @@ def write_any(
     """
     check_ending(path)
     if path.suffix.lower() in LAS_ENDINGS:
-        return LeftOut(write_cloud(path, cloud, move, crs, scale, progress, advance, returning=returning))
+        points = write_cloud(path, cloud, move, crs, scale, progress, advance, returning=returning)
+        return LeftOut(points, (), uncommon_of(cloud))
     task: Any = nullcontext(lambda n: None)
     if progress is not None:
         task = progress.task(f"writing {path.name}", cloud.count)
@@ -95,4 +118,4 @@ def write_any(
             if advance is not None:
                 advance(count)
 
-        return LeftOut(0, write_other(path, cloud, move, crs, both))
+        return LeftOut(0, write_other(path, cloud, move, crs, both), uncommon_of(cloud))

@@ -53,8 +53,9 @@ Scale = Annotated[
     Field(
         gt=0,
         allow_inf_nan=False,
-        description="step of the coordinates of the LAS file that is written, in units of its CRS; if not "
-        "given a millimetre, or the input's own where that is finer, as long as 32 bits hold the cloud",
+        description="step of the coordinates of the LAS file that is written, in units of its CRS, metres "
+        "where those are degrees; if not given a millimetre, or the input's own where that is finer, as long "
+        "as 32 bits hold the cloud",
     ),
     Shown(OUTPUT),
 ]

@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 
+import mtpcr_geo as mg
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.cloud import Cloud
 from mtpcr_geo.core.errors import CrsError, InputError, OutputError
 from mtpcr_geo.core.types import Pair, Side
 from mtpcr_geo.crs import TransformChain, resolve_frames
-from mtpcr_geo.export.apply import apply_transform, far_text, moved_by
+from mtpcr_geo.export.apply import apply_transform, far_text, heights_text, moved_by
 from mtpcr_geo.export.descriptions import shift_text, transform_rows
 from mtpcr_geo.export.pdal_file import write_pdal_pipeline
 from mtpcr_geo.export.prior_file import read_pose
@@ -27,8 +28,10 @@ from mtpcr_geo.export.transform import (
     write_transform_json,
 )
 from mtpcr_geo.io import ArrayCloud
+from mtpcr_geo.io.formats import open_any
 from mtpcr_geo.io.las import open_cloud
 from mtpcr_geo.io.write import write_cloud
+from mtpcr_geo.io.write_any import write_any
 
 UTM, FEET = CRS.from_epsg(2993), CRS.from_epsg(2994)
 GEOGRAPHIC = CRS.from_epsg(4152)  # the datum of both
@@ -338,6 +341,70 @@ def test_apply_writes_no_other_format_and_never_over_its_own_transform(tmp_path)
     assert (tmp_path / "t.json").read_bytes() == before
 
 
+WITH_HEIGHTS = "EPSG:2993+5703"  # the metric test system, heights above NAVD88
+
+
+@pytest.mark.parametrize("side", ["source", "target"])
+def test_apply_takes_the_file_that_was_registered_by_a_crs_given_for_it(tmp_path, side):
+    stated = CRS.from_epsg(4326) if side == "source" else UTM
+    source = ArrayCloud(site(), stated, name="source.laz")
+    target = ArrayCloud(site(seed=1), CRS.from_epsg(26910), name="target.laz")
+    frame, target_link, source_link = resolve_frames(
+        target, source, source_crs=WITH_HEIGHTS, target_crs=WITH_HEIGHTS
+    )
+    sides = [
+        Side("target", target, target_link, target_link.to_work(target.xyz)),
+        Side("source", source, source_link, source_link.to_work(source.xyz)),
+    ]
+    pair = Pair(target=sides[0], source=sides[1], frame=frame, T_target_source=T_WORK)
+    write_transform_json(tmp_path / "t.json", pair)
+    chain = read_transform(tmp_path / "t.json")
+    inverse = side == "target"
+    given, other = (target, source) if inverse else (source, target)
+    assert moved_by(chain, given, inverse=inverse).count == 600
+    assert moved_by(TransformChain.of(pair), given, inverse=inverse).count == 600
+    with pytest.raises(CrsError, match="--cloud-crs"):
+        moved_by(chain, ArrayCloud(site(), FEET), inverse=inverse)
+    if side == "source":
+        with pytest.raises(CrsError, match="starts from"):
+            moved_by(chain, other, inverse=inverse)
+
+
+def test_apply_takes_a_cloud_that_states_the_plan_alone(tmp_path):
+    pair = a_pair(source_crs=CRS.from_user_input(WITH_HEIGHTS), target_crs=CRS.from_user_input(WITH_HEIGHTS))
+    chain = TransformChain.of(pair)
+    silent = ArrayCloud(site(), UTM)
+    assert np.array_equal(moved_by(chain, silent).to_array(), chain.forward(site()))
+    said = heights_text(chain, silent)
+    assert said is not None
+    assert "says nothing of heights: they are taken as NAVD88 height, as those of the source" in said
+    assert heights_text(chain, ArrayCloud(site(), chain.source.file_crs)) is None
+    assert heights_text(chain, ArrayCloud(site(), None)) is None
+    # heights of another kind, or in another unit, are not those of the frame
+    for other in ("EPSG:2993+6360", "EPSG:2993+5702", "EPSG:2994", "EPSG:26910"):
+        with pytest.raises(CrsError, match="starts from"):
+            moved_by(chain, ArrayCloud(site(), CRS.from_user_input(other)))
+    with pytest.raises(CrsError, match="starts from"):
+        moved_by(TransformChain.of(a_pair()), ArrayCloud(site(), CRS.from_user_input(WITH_HEIGHTS)))
+
+
+def test_apply_takes_the_crs_that_is_given_instead_of_the_one_stated(tmp_path):
+    pair = a_pair()
+    write_transform_json(tmp_path / "t.json", pair)
+    write_cloud(tmp_path / "in.laz", ArrayCloud(site(), CRS.from_epsg(26910)), None, CRS.from_epsg(26910))
+    paths = tmp_path / "t.json", tmp_path / "in.laz", tmp_path / "out.laz"
+    with pytest.raises(CrsError, match="--cloud-crs"):
+        apply_transform(*paths)
+    with pytest.raises(CrsError, match=r"give cloud_crs if"):
+        mg.apply(*paths[:2])
+    apply_transform(*paths, cloud_crs="EPSG:2993")
+    expected = TransformChain.of(pair).forward(site())
+    assert np.abs(open_cloud(tmp_path / "out.laz").to_array() - expected).max() < 0.002
+    moved = mg.apply(*paths[:2], cloud_crs="local")
+    assert isinstance(moved, Cloud)
+    assert np.abs(moved.to_array() - expected).max() < 0.002
+
+
 @pytest.mark.parametrize("inverse", [False, True])
 def test_apply_refuses_a_cloud_without_crs_that_lies_far_away(tmp_path, inverse):
     pair = a_pair(source_path=tmp_path / "source.laz")
@@ -415,3 +482,88 @@ def test_json_is_read_back_as_it_was(value):
 def test_numbers_have_17_digits():
     assert dumps(0.1) == "0.10000000000000001"
     assert dumps(np.array([[1.0, 2.5]])) == "[\n  [1.0, 2.5]\n]"
+
+
+def metres_of(crs, xyz):
+    """Metres a unit of x, y and z of coordinates at a place."""
+    if crs is None or crs == UTM:
+        return np.ones(3)
+    if crs == FEET:
+        return np.full(3, 0.3048)
+    lat = np.radians(xyz[0, 1])
+    lon_m = 111_412.84 * np.cos(lat) - 93.5 * np.cos(3 * lat)
+    return np.array([lon_m, 111_132.95 - 559.85 * np.cos(2 * lat) + 1.17 * np.cos(4 * lat), 1.0])
+
+
+def with_normals(xyz, crs, names, kind=np.float64):
+    rng = np.random.default_rng(8)
+    vectors = rng.normal(size=(len(xyz), 3))
+    vectors /= np.linalg.norm(vectors, axis=1)[:, None]
+    extra = {name: vectors[:, i].astype(kind) for i, name in enumerate(names)}
+    return vectors, ArrayCloud(xyz, crs, "normals", extra)
+
+
+def normals_of(path, names):
+    table = next(iter(open_any(path).table_chunks()))
+    by_lower = {name.lower(): np.asarray(values) for name, values in table.items()}
+    return np.column_stack([by_lower[name.lower()] for name in names])
+
+
+@pytest.mark.parametrize("ending", ["laz", "ply", "csv"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_normals_turn_with_the_points(tmp_path, kind, ending):
+    pair = pair_of(kind)
+    write_transform_json(tmp_path / "t.json", pair)
+    chain = read_transform(tmp_path / "t.json")
+    names = {"laz": ("NormalX", "NormalY", "NormalZ"), "ply": ("nx", "ny", "nz")}.get(
+        ending, ("Nx", "Ny", "Nz")
+    )
+    xyz, crs = file_xyz(pair.source.cloud), chain.source.file_crs
+    vectors, cloud = with_normals(xyz, crs, names)
+    write_any(tmp_path / f"in.{ending}", cloud, None, crs)
+    paths = (tmp_path / "t.json", tmp_path / f"in.{ending}", tmp_path / f"out.{ending}")
+    apply_transform(*paths, cloud_crs=None if ending == "laz" else "local" if crs is None else crs.to_wkt())
+    # where the points a metre along the normals come to
+    moved = chain.forward(xyz)
+    ahead = chain.forward(xyz + vectors / metres_of(crs, xyz))
+    expected = (ahead - moved) * metres_of(chain.target.file_crs, moved)
+    expected /= np.linalg.norm(expected, axis=1)[:, None]
+    found = normals_of(paths[2], names)
+    assert np.abs(np.linalg.norm(found, axis=1) - 1.0).max() < 1e-9
+    assert np.abs(found - expected).max() < (1e-7 if "degrees" not in kind and "out" not in kind else 1e-3)
+    back = tmp_path / f"back.{ending}"
+    apply_transform(paths[0], paths[2], back, inverse=True, cloud_crs="local")
+    assert np.abs(normals_of(back, names) - vectors).max() < 1e-9
+
+
+def test_what_is_no_direction_is_not_turned(tmp_path):
+    pair = a_pair()
+    chain = TransformChain.of(pair)
+    _, cloud = with_normals(site(), UTM, ("NormalX", "NormalY", "NormalZ"), np.int8)
+    cloud.extra |= {"nx": np.ones(600), "ny": np.ones(600), "range": np.linspace(0, 1, 600)}
+    (table,) = moved_by(chain, cloud).table_chunks()
+    for name, values in cloud.extra.items():
+        assert np.array_equal(table[name], values), name
+    write_cloud(tmp_path / "out.laz", cloud, chain.motion(), UTM)
+    assert np.array_equal(laspy.read(tmp_path / "out.laz")["NormalY"], cloud.extra["NormalY"])
+
+
+@pytest.mark.parametrize("kind", ["metres", "feet to metres", "metres to degrees"])
+def test_directions_of_waveforms_turn_with_the_points(tmp_path, kind):
+    pair = pair_of(kind)
+    chain = TransformChain.of(pair)
+    crs, xyz = chain.source.file_crs, file_xyz(pair.source.cloud)
+    header = laspy.LasHeader(version="1.4", point_format=9)
+    header.scales, header.offsets = np.full(3, 0.001), np.floor(xyz[0])
+    las = laspy.LasData(header)
+    las.xyz = xyz
+    beams = np.random.default_rng(9).normal(size=(600, 3)) * 1.5e-4
+    for i, name in enumerate(("x_t", "y_t", "z_t")):
+        las[name] = beams[:, i]
+    las.write(tmp_path / "in.las")
+    write_cloud(tmp_path / "out.las", open_cloud(tmp_path / "in.las", crs), chain.motion(), None)
+    written = laspy.read(tmp_path / "out.las")
+    found = np.column_stack([written[name] for name in ("x_t", "y_t", "z_t")])
+    far = 1e5  # picoseconds
+    expected = (chain.forward(las.xyz + far * beams) - chain.forward(las.xyz)) / far
+    assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()

@@ -136,6 +136,35 @@ def test_heights(name):
         assert facts.vertical.datum.name.startswith(datum)
 
 
+STATED_UNITS = {
+    "US survey feet": ([(4096, 5703), (4099, 9003)], 6360, 1200 / 3937),
+    "feet": ([(4096, 5703), (4099, 9002)], 8228, 0.3048),
+    "US survey feet, under the datum's key": ([(4098, 5703), (4099, 9003)], 6360, 1200 / 3937),
+    "metres of a system in feet": ([(4096, 6360), (4099, 9001)], 5703, 1.0),
+    "a unit that EPSG has not with this datum": ([(4096, 5783), (4099, 9003)], None, 1200 / 3937),
+    "its own": ([(4096, 5703), (4099, 9001)], 5703, 1.0),
+    "none": ([(4096, 5703)], 5703, 1.0),
+}
+
+
+@pytest.mark.parametrize("name", STATED_UNITS)
+def test_heights_are_in_the_unit_that_is_stated_beside_the_code_of_a_system(name):
+    keys, code, unit = STATED_UNITS[name]
+    crs, problem = read((1024, 1), (3072, 2263), (3076, 9003), *keys)
+    facts = facts_of(crs)
+    assert facts.height_unit == pytest.approx(unit, rel=1e-9)
+    assert facts.unit == pytest.approx(1200 / 3937)
+    assert facts.height == "datum"
+    assert facts.vertical is not None
+    assert facts.vertical.to_epsg() == code
+    stated = dict(keys)
+    differs = name not in ("its own", "none")
+    assert bool(problem) == differs
+    if differs:
+        assert str(stated.get(4096, stated.get(4098))) in problem
+        assert "which is taken" in problem
+
+
 def test_ellipsoidal_heights_of_the_own_ellipsoid():
     crs, problem = read(*UTM, (4096, 5019))
     assert facts_of(crs).height == "ellipsoidal"

@@ -22,10 +22,11 @@ from mtpcr_geo.core.errors import CrsError, InputError
 from mtpcr_geo.export.apply import write_moved
 from mtpcr_geo.io.formats import open_any
 from mtpcr_geo.io.las import open_cloud
-from mtpcr_geo.io.many import ManyFiles, output_names
+from mtpcr_geo.io.many import ManyFiles, output_names, uncommon_of
 from mtpcr_geo.io.sample import scan
 from mtpcr_geo.io.views import Moved
 from mtpcr_geo.io.write import write_cloud
+from mtpcr_geo.io.write_any import LeftOut, write_any
 
 UTM = CRS.from_epsg(25833)
 
@@ -227,6 +228,52 @@ def test_formats_and_scales_may_differ(tmp_path):
     assert output_names([Path("a.las"), Path("x/A.las"), Path("c.npy"), Path("b.copc.laz")]) == [
         "a.las", "A_2.las", "c.laz", "b.copc.laz",
     ]  # fmt: skip
+
+
+def test_a_file_without_points_takes_no_dimension_from_the_others(tmp_path):
+    folder = tmp_path / "tiles"
+    save(folder, np.random.default_rng(6).uniform(0, 20, (400, 3)) + ORIGIN, count=2)
+    laspy.LasData(laspy.LasHeader(version="1.4", point_format=6)).write(folder / "tile_00a.las")
+    whole = open_any(folder, CRS.from_epsg(25833))
+    assert uncommon_of(whole) == ()
+    for name in ("whole.laz", "whole.ply"):
+        assert write_any(tmp_path / name, whole, None, UTM) == LeftOut()
+        table = next(open_any(tmp_path / name).table_chunks())
+        assert (table["Intensity"] == [*range(200), *range(200)]).all()
+
+
+def test_dimensions_that_not_all_files_have_are_left_out_and_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(7)
+    for name, point_format in (("a", 7), ("b", 6)):
+        header = laspy.LasHeader(version="1.4", point_format=point_format)
+        header.scales = np.full(3, 0.001)
+        if name == "a":
+            header.add_extra_dim(laspy.ExtraBytesParams("amplitude", "f4"))
+        las = laspy.LasData(header)
+        las.xyz = rng.uniform(0, 20, (300, 3))
+        las.intensity = np.full(300, 9)
+        las.write(f"{name}.laz")
+    parts = [open_any("a.laz"), open_any("b.laz")]
+    left_out = write_any(Path("whole.csv"), ManyFiles(Path("both"), UTM, parts), None, UTM)
+    assert left_out == LeftOut(0, (), ("Red", "Green", "Blue", "amplitude"))
+    assert LeftOut.read(left_out.as_dict()) == left_out
+    (said,) = left_out.sentences("whole.csv")
+    assert said == "Red, Green, Blue, amplitude left out of whole.csv: not all of the files joined have them"
+    both = {"type": "mtpcr.read", "filename": "[ab].laz"}
+    ran = mg.Pipeline([both, {"type": "mtpcr.write", "filename": "whole.laz"}])
+    ran.execute()
+    assert "amplitude" in str(ran.metadata)
+
+
+def test_columns_in_another_order_stay_themselves(tmp_path):
+    one = ArrayCloud(np.zeros((3, 3)), UTM, extra={"first": np.full(3, 1.0), "second": np.full(3, 2.0)})
+    other = ArrayCloud(np.ones((3, 3)), UTM, extra={"second": np.full(3, 2.0), "first": np.full(3, 1.0)})
+    whole = ManyFiles(tmp_path, UTM, [one, other])
+    write_any(tmp_path / "whole.ply", whole, None, UTM)
+    table = next(open_any(tmp_path / "whole.ply").table_chunks())
+    assert (table["first"] == 1).all()
+    assert (table["second"] == 2).all()
 
 
 def test_what_names_nothing_is_said(tmp_path):

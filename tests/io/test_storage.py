@@ -68,6 +68,20 @@ def test_a_scale_that_is_asked_for_is_kept(tmp_path):
     assert laspy.read(tmp_path / "out.laz").header.scales[0] == 0.0001
 
 
+@pytest.mark.parametrize("code", ["EPSG:4326", "EPSG:4979", "EPSG:4326+5773"])
+def test_a_scale_for_degrees_is_a_length(code, tmp_path):
+    crs = CRS.from_user_input(code)
+    xyz = np.array([9.0, 50.0, 100.0]) + np.random.default_rng(1).uniform(0, [0.01, 0.01, 20], (500, 3))
+    cloud = ArrayCloud(xyz, crs)
+    write_cloud(tmp_path / "out.laz", cloud, None, crs, 0.001)
+    written = laspy.read(tmp_path / "out.laz")
+    assert np.allclose(written.header.scales, [1e-8, 1e-8, 0.001], rtol=1e-12)
+    assert (np.abs(written.xyz - xyz).max(axis=0) <= [0.51e-8, 0.51e-8, 0.51e-3]).all()
+    # one for each axis is in the unit of that axis
+    write_cloud(tmp_path / "each.laz", cloud, None, crs, (1e-7, 1e-6, 0.01))
+    assert laspy.read(tmp_path / "each.laz").header.scales.tolist() == [1e-7, 1e-6, 0.01]
+
+
 def test_a_finer_scale_grows_where_the_header_promised_less(tmp_path):
     # returning_scales trusts the header that all lies on one place: a hundredth of a millimetre spans 21 km
     xyz = site()

@@ -120,6 +120,27 @@ def test_scans_of_e57_stay_scans(tmp_path):
     assert np.abs(first["cartesianX"] - XYZ[: N // 2, 0]).max() < 1e-5
 
 
+@pytest.mark.parametrize("ending", [*WRITTEN, "laz", "e57"])
+def test_invalid_points_of_e57_are_no_points(ending, tmp_path):
+    pye57 = pytest.importorskip("pye57", reason="pye57 is not installed")
+    invalid = np.zeros(N, np.int8)
+    invalid[::10] = 1
+    invalid[5] = 2
+    with pye57.E57(str(tmp_path / "a.e57"), mode="w") as file:
+        for some in (invalid, None):
+            data = {f"cartesian{axis}": XYZ[:, i] - XYZ[0, i] for i, axis in enumerate("XYZ")}
+            if some is not None:
+                data["cartesianInvalidState"] = some
+            file.write_scan_raw(data)
+    cloud = open_any(tmp_path / "a.e57", UTM)
+    expected = np.concatenate([XYZ[invalid == 0], XYZ]) - XYZ[0]
+    assert cloud.count == len(expected)
+    write_any(tmp_path / f"out.{ending}", cloud, None, UTM)
+    back = open_any(tmp_path / f"out.{ending}")
+    assert back.count == len(expected)
+    assert np.abs(back.to_array() - expected).max() < 0.001
+
+
 def test_sixteen_bit_colours_and_wide_integers_are_kept(tmp_path):
     colours: dict[str, np.ndarray] = {
         one: RNG.integers(0, 65536, N).astype(np.uint16) for one in ("Red", "Green", "Blue")

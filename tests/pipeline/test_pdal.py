@@ -12,11 +12,13 @@ import laspy
 import numpy as np
 import pytest
 from conftest import REPOSITORY
+from pyproj import CRS
 
 import mtpcr_geo
-from mtpcr_geo.core.cloud import Cloud
+from mtpcr_geo.core.cloud import ArrayCloud, Cloud
 from mtpcr_geo.core.types import Pair
 from mtpcr_geo.export.apply import apply_transform
+from mtpcr_geo.io.las import open_cloud
 from mtpcr_geo.io.write import write_cloud
 from mtpcr_geo.registration import register
 
@@ -287,3 +289,28 @@ def test_benchmark_of_rasters_runs(pdal, town_files):
     table = json.loads(done.stdout)
     assert set(table) == {"mtpcr-geo", "PDAL"}
     assert all(row["best_s"] > 0 for row in table.values())
+
+
+@pytest.mark.parametrize(
+    ("code", "place", "size"),
+    [
+        ("EPSG:4979", [9.0, 50.0, 100.0], 1e-3),
+        ("EPSG:4978", [4.06e6, 6.4e5, 4.86e6], 50.0),
+        ("EPSG:25832+5783", [5e5, 5.5e6, 100.0], 50.0),
+    ],
+)
+def test_points_are_handed_to_pdal_whatever_their_system(code, place, size, pdal, tmp_path):
+    crs = CRS.from_user_input(code)
+    xyz = np.array(place) + np.random.default_rng(2).uniform(0, size, (400, 3))
+    write_cloud(tmp_path / "in.laz", ArrayCloud(xyz, crs), None, crs)
+    reader = {"type": "mtpcr.read", "filename": str(tmp_path / "in.laz")}
+    crop = {"type": "filters.crop", "bounds": f"([{place[0] - 1}, {place[0] + size / 2}], [0, 1e8])"}
+    writer = {"type": "mtpcr.write", "filename": str(tmp_path / "out.laz")}
+    run_ours([reader, crop, {"type": "filters.outlier", "multiplier": 100}, writer])
+    written, found = open_cloud(tmp_path / "in.laz"), open_cloud(tmp_path / "out.laz")
+    kept = written.to_array()
+    kept = kept[kept[:, 0] <= place[0] + size / 2]
+    assert found.count == len(kept) < 400
+    assert np.abs(found.to_array() - kept).max() < 1e-5 * size
+    assert found.crs is not None
+    assert found.crs.equals(crs, ignore_axis_order=True)

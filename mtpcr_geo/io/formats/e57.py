@@ -41,7 +41,7 @@ class E57Cloud(FileCloud):
 
 
 def open_file(path: Path, crs: CRS | None) -> E57Cloud:
-    """Open an E57 file; its headers are read.
+    """Open an E57 file; its headers are read, and which points are valid, where a header tells of such.
 
     Raises:
         InputError: if it is none, or holds no scan.
@@ -51,9 +51,21 @@ def open_file(path: Path, crs: CRS | None) -> E57Cloud:
     with reported(path), _opened(path) as file:
         if not file.scan_count:
             raise InputError(f"{path} holds no scan; export its points as well, not its images alone")
-        count = sum(file.get_header(number).point_count for number in range(file.scan_count))
+        count = sum(_valid_points(file, number) for number in range(file.scan_count))
         stated = crs or _stated_crs(file)
     return E57Cloud(path, stated, "E57", int(count))
+
+
+def _valid_points(file: Any, number: int) -> int:
+    """Return how many points of a scan `read_scan` gives: all, but for those that are marked as invalid."""
+    header = file.get_header(number)
+    state = "cartesianInvalidState" if "cartesianX" in header.point_fields else "sphericalInvalidState"
+    count = int(header.point_count)
+    if state not in header.point_fields or not count:
+        return count
+    data, buffers = file.make_buffers([state], count)
+    header.points.reader(buffers).read()
+    return int((data[state] == 0).sum())
 
 
 def _stated_crs(file: Any) -> CRS | None:

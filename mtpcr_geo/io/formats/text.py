@@ -15,6 +15,7 @@ from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import CHUNK_POINTS, PointTable
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.io.file_cloud import FileCloud, named, reported, require_xyz
+from mtpcr_geo.io.formats.text_found import LOOKED_AT, empty_place, found_layout, to_text
 from mtpcr_geo.io.formats.text_layout import LEFT_OUT, TextLayout
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ class TextCloud(FileCloud):
     def columns(self, size: int) -> Iterator[PointTable]:
         """Yield columns by name."""
         with self.path.open("rb") as stream:
+            to_text(self.path, stream)
             for _ in range(self.head):
                 stream.readline()
             for rows in rows_of(stream, size, layout=self.layout):
@@ -68,11 +70,13 @@ def open_file(path: Path, crs: CRS | None, layout: TextLayout | None = None) -> 
     """Open a text file: columns as declared, or by its first line where that names them, or by their number.
 
     Raises:
-        InputError: if its lines are no points.
+        InputError: if its lines are no points, or a coordinate is missing.
 
     """
     layout = layout or TextLayout()
     with reported(path), path.open("rb") as stream:
+        to_text(path, stream)
+        layout = _completed(path, stream, layout)
         names, head = _declared_head(stream, layout) if layout.columns else _head(path, stream, layout)
         count, low, high, whole = 0, np.array([]), np.array([]), np.array([])
         for rows in rows_of(stream, CHUNK_POINTS, layout=layout):
@@ -94,7 +98,34 @@ def open_file(path: Path, crs: CRS | None, layout: TextLayout | None = None) -> 
     cloud = TextCloud(path, crs, count, names, kinds, head, layout)
     place = [[name.lower() for name in names].index(axis) for axis in "xyz"]
     cloud.minimum, cloud.maximum = low[place], high[place]
+    if layout.separator and np.isnan(cloud.minimum).any():
+        _check_complete(cloud, [layout.kept[i] for i in place] if layout.columns else place)
     return cloud
+
+
+def _completed(path: Path, stream: BinaryIO, layout: TextLayout) -> TextLayout:
+    """Return a layout completed by the first lines, the stream where it was."""
+    begin = stream.tell()
+    for _ in range(layout.skip or 0):
+        stream.readline()
+    layout = found_layout(path, list(islice(stream, LOOKED_AT)), layout)
+    stream.seek(begin)
+    return layout
+
+
+def _check_complete(cloud: TextCloud, places: list[int]) -> None:
+    """Refuse a file in which x, y or z of a point is empty.
+
+    Raises:
+        InputError: naming the line.
+
+    """
+    with cloud.path.open("rb") as stream:
+        found = empty_place(stream, cloud.layout, places, cloud.head)
+    if found is not None:
+        raise InputError(
+            f"line {found[0]} of {cloud.path} has no {'xyz'[found[1]]}; complete it, or leave the line out"
+        )
 
 
 def rows_of(
@@ -139,13 +170,16 @@ def rows_of(
 
 def _separated(line: bytes, layout: TextLayout) -> bytes:
     """Return a line without its comment, with a decimal point, and columns apart; empty ones hold nan."""
-    line = line.split(b"#")[0].strip(b"\r\n ")
+    line = line.split(b"#")[0].replace(b'"', b"").strip(b"\r\n ")
     if layout.separator is None:
         # a decimal comma leaves semicolons, tabs and blanks
         line = re.sub(rb"[;\t]+" if layout.decimal == "," else rb"[,;\t]+", b" ", line)
     elif layout.separator:
         sign = layout.separator.encode()
-        line = re.sub(re.escape(sign) + rb"[ ]*(?=" + re.escape(sign) + rb"|$)", sign + b"nan", line)
+        if sign + sign in line or b" " in line or line.endswith(sign):
+            line = re.sub(re.escape(sign) + rb"[ ]*(?=" + re.escape(sign) + rb"|$)", sign + b"nan", line)
+        if line.startswith(sign):
+            line = b"nan" + line
     return line.replace(b",", b".") if layout.decimal == "," else line
 
 

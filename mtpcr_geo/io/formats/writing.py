@@ -17,6 +17,7 @@ from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 from mtpcr_geo.core.errors import InputError, MissingPartError, OutputError
 from mtpcr_geo.io.dimensions import PDAL_NAMES
+from mtpcr_geo.io.directions import turned_columns
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -43,7 +44,8 @@ def write_other(
     Args:
         path: where to write; the ending is the format.
         cloud: what to write.
-        move: takes (n, 3) file coordinates of `cloud` to those to be written; None leaves them.
+        move: takes (n, 3) file coordinates of `cloud` to those to be written; None leaves them. By a `Motion`
+            normals turn with the points.
         crs: CRS of the written coordinates, for the digits that degrees need; these formats state none.
         advance: called with the number of points of each chunk written.
 
@@ -108,7 +110,8 @@ class _Columns:
                 yield table
                 continue
             xyz = self.move(np.column_stack([np.asarray(table[axis], np.float64) for axis in "XYZ"]))
-            yield {**table, **{axis: xyz[:, i] for i, axis in enumerate("XYZ")}}
+            moved = {axis: xyz[:, i] for i, axis in enumerate("XYZ")}
+            yield {**table, **turned_columns(table, self.move), **moved}
 
 
 def _streamed(path: Path, columns: _Columns, head: bytes, dtype: np.dtype[Any], advance: Any) -> None:

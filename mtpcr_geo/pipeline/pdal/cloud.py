@@ -14,6 +14,7 @@ from mtpcr_geo.core.cloud import CHUNK_POINTS, Cloud, PointTable
 from mtpcr_geo.core.errors import InputError
 from mtpcr_geo.io.dimensions import separate_legacy_flags
 from mtpcr_geo.io.las import LasCloud
+from mtpcr_geo.io.layout import wkt_of
 from mtpcr_geo.io.views import Moved, xyz_of
 from mtpcr_geo.io.write import write_cloud
 from mtpcr_geo.pipeline.pdal import bindings, process
@@ -230,7 +231,7 @@ def _spooled(cloud: Cloud, tag: str, context: RunContext) -> dict[str, Any]:
         context.spool.add(cloud, path)
     reader: dict[str, Any] = {"type": "readers.las", "tag": tag, "filename": str(path)}
     if cloud.crs is not None:
-        reader["override_srs"] = cloud.crs.to_wkt("WKT1_GDAL")
+        reader["override_srs"] = wkt_of(cloud.crs)
     return reader
 
 

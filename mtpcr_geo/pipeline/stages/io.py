@@ -250,7 +250,9 @@ class LasWriter(Stage):
 
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Stream the cloud to the file, and hand it on."""
+        from mtpcr_geo.io.many import uncommon_of
         from mtpcr_geo.io.write import write_cloud
+        from mtpcr_geo.io.write_any import LeftOut
 
         cloud = one_cloud(self, inputs)
         crs = stated_crs(self, "a_srs", self.options.a_srs) or cloud.crs
@@ -258,10 +260,9 @@ class LasWriter(Stage):
         path = context.outputs.path(self.options.filename)
         base, move = (cloud.base, cloud.move) if isinstance(cloud, Moved) else (cloud, None)
         with context.progress.task(f"writing {self.options.filename.name}", cloud.count) as advance:
-            left_out = write_cloud(path, base, move, crs, scale, advance=advance)
-        self.metadata |= {"filename": str(self.options.filename), "count": cloud.count - left_out}
-        if left_out:
-            self.metadata["left_out"] = left_out
+            points = write_cloud(path, base, move, crs, scale, advance=advance)
+        self.metadata |= {"filename": str(self.options.filename), "count": cloud.count - points}
+        self.metadata |= LeftOut(points, (), uncommon_of(base)).as_dict()
         return cloud
 
 
@@ -305,10 +306,7 @@ class FileWriter(Stage):
         with context.progress.task(f"writing {self.options.filename.name}", cloud.count) as advance:
             left_out = write_any(path, base, move, crs, self.options.scale, advance=advance)
         self.metadata |= {"filename": str(self.options.filename), "count": cloud.count - left_out.points}
-        if left_out.points:
-            self.metadata["left_out"] = left_out.points
-        if left_out.dimensions:
-            self.metadata["dimensions_left_out"] = list(left_out.dimensions)
+        self.metadata |= left_out.as_dict()
         return cloud
 
 
@@ -334,7 +332,7 @@ class EachWriter(Stage):
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Stream each part to its file, and hand the cloud on."""
         from mtpcr_geo.io.many import ManyFiles
-        from mtpcr_geo.io.write_any import write_any
+        from mtpcr_geo.io.write_any import LeftOut, write_any
 
         cloud = one_cloud(self, inputs)
         base, move = (cloud.base, cloud.move) if isinstance(cloud, Moved) else (cloud, None)
@@ -343,18 +341,15 @@ class EachWriter(Stage):
             raise OptionError(
                 f"{self.label}: {len(parts)} files are to be written, and {len(self.options.names)} named"
             )
-        left_out, dimensions = 0, dict[str, None]()
+        left_out: list[LeftOut] = []
         with context.progress.task(f"writing {len(parts)} files", cloud.count) as advance:
             for part, final in zip(parts, self.writes(), strict=True):
                 path, scale = context.outputs.path(final), self.options.scale
-                missing = write_any(path, part, move, cloud.crs, scale, advance=advance)
-                left_out += missing.points
-                dimensions |= dict.fromkeys(missing.dimensions)
-        self.metadata |= {"filename": str(self.options.filename), "count": cloud.count - left_out}
-        if left_out:
-            self.metadata["left_out"] = left_out
-        if dimensions:
-            self.metadata["dimensions_left_out"] = list(dimensions)
+                left_out.append(write_any(path, part, move, cloud.crs, scale, advance=advance))
+        points = sum(one.points for one in left_out)
+        dimensions = tuple(dict.fromkeys(name for one in left_out for name in one.dimensions))
+        self.metadata |= {"filename": str(self.options.filename), "count": cloud.count - points}
+        self.metadata |= LeftOut(points, dimensions).as_dict()
         return cloud
 
 
