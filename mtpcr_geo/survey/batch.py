@@ -25,6 +25,7 @@ from mtpcr_geo.core.progress import NoProgress, Progress
 from mtpcr_geo.core.wording import in_a_line
 from mtpcr_geo.registration import Registration, register
 from mtpcr_geo.survey import is_survey
+from mtpcr_geo.survey.earlier import remove_earlier
 from mtpcr_geo.survey.engine import engine_of
 from mtpcr_geo.survey.index import write_atomic
 from mtpcr_geo.survey.jobs import Job
@@ -56,7 +57,7 @@ class Row:
         sigma_plan_m: standard deviation of the place, metres.
         seconds: wall time of the job.
         reason: the first reason of the verdict, or the error.
-        folder: of the job's files, relative to the batch.
+        folder: of the job's files, relative to the batch; "" where it left none.
         T_target_source: 4x4 between the coordinates of the files, row by row; empty where none was found.
         footprint: outline of the source in the target's CRS, x and y in turns.
         crs: the target's CRS as WKT; "" where it is local.
@@ -140,15 +141,15 @@ def run_batch(
     if link is not None:
         raise OutputError(f"{link} is a link, and a batch keeps its files in its own folder; remove it")
     write_atomic(folder / MARK, json.dumps({"format": "mtpcr-geo batch", "version": 1}))
+    # an earlier row of a job that has changed since says nothing of it
     rows = {job.name: _row_of(folder, job) for job in jobs}
-    left = [_Task(job, folder) for job in jobs if _is_left(rows[job.name], job, options)]
+    left = [_Task(job, folder) for job in jobs if _is_left(rows[job.name], options)]
     try:
         with engine_of(options, max(len(left), 1)) as engine, progress.task("jobs", len(left)) as advance:
             for outcome in engine.run(do, left, options.retries):
                 row = outcome.made
                 if row is None:
-                    row = _failed(outcome.item.job, outcome.error or "")
-                    _write_row(folder, row)
+                    row = _without_result(outcome.item, _failed(outcome.item.job, outcome.error or ""))
                 rows[row.name] = row
                 advance(1)
     finally:
@@ -167,20 +168,34 @@ def do(task: _Task) -> Row:
         # what an earlier try of this job left gives way
         run_one = register_in_survey if is_survey(job.target) else register
         result = run_one(job.source, job.target, folder, overwrite=True, **given)
-        row = _judged(job, result)
     except RegistrationError as error:
         # a survey that has no place for it refuses it, as a target does
         row = replace(_failed(job, str(error)), verdict="refused")
+        return _without_result(task, row, started)
     except MtpcrError as error:
-        row = _failed(job, f"{type(error).__name__}: {error}")
+        return _without_result(task, _failed(job, f"{type(error).__name__}: {error}"), started)
     seconds = round(time.perf_counter() - started, 3)
-    row = replace(row, seconds=seconds, folder=f"{_JOBS}/{job.name}" if folder.is_dir() else "")
+    row = replace(_judged(job, result), seconds=seconds, folder=f"{_JOBS}/{job.name}")
     _write_row(task.folder, row)
     return row
 
 
-def _is_left(row: Row | None, job: Job, options: BatchOptions) -> bool:
-    return row is None or row.failed or options.overwrite or row.key != job.key
+def _without_result(task: _Task, row: Row, started: float | None = None) -> Row:
+    """Write the row of a job that left no result, and remove that of an earlier run of another input."""
+    seconds = 0.0 if started is None else round(time.perf_counter() - started, 3)
+    row = replace(row, seconds=seconds, folder="")
+    # the row comes first: whatever ends this, the table claims no result that is another's
+    _write_row(task.folder, row)
+    try:
+        remove_earlier(task.folder / _JOBS / task.job.name, (task.job.source, task.job.target))
+    except OutputError as error:
+        row = replace(row, reason=f"{row.reason}; and an earlier result stays: {error}")
+        _write_row(task.folder, row)
+    return row
+
+
+def _is_left(row: Row | None, options: BatchOptions) -> bool:
+    return row is None or row.failed or options.overwrite
 
 
 def _failed(job: Job, why: str) -> Row:
@@ -238,14 +253,14 @@ def _write_row(folder: Path, row: Row) -> None:
 
 
 def _row_of(folder: Path, job: Job) -> Row | None:
-    """Return the row of a job; None where there is none that can be read."""
+    """Return the row of a job; None where there is none that can be read, or it is of another input."""
     from pydantic import TypeAdapter, ValidationError
 
     try:
         row = TypeAdapter(Row).validate_json(read_whole(_row_path(folder, job.name)))
     except (OSError, ValidationError, InputError):
         return None
-    return row if row.name == job.name and _is_placed(row) else None
+    return row if (row.name, row.key) == (job.name, job.key) and _is_placed(row) else None
 
 
 def _is_placed(row: Row) -> bool:
