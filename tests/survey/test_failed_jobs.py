@@ -11,6 +11,7 @@ from helpers_survey import town_source, town_target, write_tile
 
 from mtpcr_geo.survey.batch import Row, run_batch
 from mtpcr_geo.survey.build import build_survey
+from mtpcr_geo.survey.engine import Engine
 from mtpcr_geo.survey.jobs import Job
 from mtpcr_geo.survey.options import BatchOptions, BuildOptions
 
@@ -78,3 +79,29 @@ def test_what_a_job_reads_is_never_removed(copied: Path) -> None:
     assert row.verdict == "failed"
     assert own.is_file()
     assert not (own.parent / "scan1.laz").exists()
+
+
+def test_a_defect_fails_its_job_alone(done: Path, tmp_path: Path) -> None:
+    target = done / "target.laz"
+    jobs = [
+        Job("odd", done / "scans" / "scan0.laz", target, {"progress": "no progress at all"}),
+        Job("none", done / "none.laz", target, {}),
+    ]
+    odd, none = run_batch(jobs, tmp_path / "batch", HERE).rows
+    assert odd.verdict == none.verdict == "failed"
+    assert odd.reason.startswith("a defect: AttributeError")
+    assert none.reason.startswith("InputError")
+    assert (tmp_path / "batch" / "rows" / "odd.json").is_file()
+
+
+def test_a_piece_of_work_that_fails_says_where() -> None:
+    first, second = Engine().run(reciprocal, [0, 2])
+    assert first.made is None
+    assert first.error is not None
+    assert first.error.startswith("a defect: ZeroDivisionError")
+    assert "test_failed_jobs.py, line" in first.error
+    assert (second.made, second.error) == (0.5, None)
+
+
+def reciprocal(number: int) -> float:
+    return 1 / number
