@@ -11,6 +11,7 @@ import io
 import json
 import os
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.errors import InputError, MtpcrError, OutputError, RegistrationError
+from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError, OutputError, RegistrationError
 from mtpcr_geo.core.paths import link_among, read_whole
 from mtpcr_geo.core.progress import NoProgress, Progress
 from mtpcr_geo.core.wording import in_a_line
@@ -128,12 +129,17 @@ def run_batch(
         progress: receives the number of jobs done.
 
     Raises:
+        OptionError: if jobs share a name, upper and lower case taken as one.
         OutputError: if the folder holds something else, or cannot be written.
         MissingPartError: if more than one worker is wanted and Dask is not installed.
 
     """
     folder = Path(folder)
     progress = progress or NoProgress()
+    taken = Counter(job.name.casefold() for job in jobs)
+    again = next((job.name for job in jobs if taken[job.name.casefold()] > 1), None)
+    if again is not None:
+        raise OptionError(f"{taken[again.casefold()]} jobs are called {again}; give each a name of its own")
     foreign = os.path.exists(folder) and not os.path.isfile(folder / MARK)
     if foreign and not options.overwrite and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder} is there already, and is no batch; name another folder, or --overwrite")

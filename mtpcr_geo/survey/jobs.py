@@ -7,7 +7,8 @@ import io
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -16,7 +17,6 @@ from typing import Any
 from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError
 from mtpcr_geo.core.paths import read_whole, real
 from mtpcr_geo.io.formats import files_at
-from mtpcr_geo.io.many import output_names
 from mtpcr_geo.pipeline.options import RegisterOptions
 from mtpcr_geo.registration import read_options
 from mtpcr_geo.survey import is_survey
@@ -72,9 +72,8 @@ def jobs_of(path: Path, target: Path | None, common: Mapping[str, Any]) -> list[
     sources = files_at(path)
     if target is None:
         raise OptionError("name the target of the sources: --target FILE, or the folder of a survey")
-    names = [_name(Path(name).stem) for name in output_names(sources)]
     options = _given(common)
-    return [Job(name, source, target, options) for name, source in zip(names, sources, strict=True)]
+    return [Job(name, source, target, options) for name, source in _named(sources)]
 
 
 def _of_table(path: Path, target: Path | None, common: Mapping[str, Any]) -> list[Job]:
@@ -132,6 +131,24 @@ def _value(name: str, text: str) -> Any:
     if field is not None and field.annotation is bool:
         return {"": False, "yes": True, "no": False}.get(text.lower(), text)
     return text
+
+
+def _named(sources: Sequence[Path]) -> list[tuple[str, Path]]:
+    """Return each source with a name that no other has, upper and lower case taken as one.
+
+    Of names that would be the same each gets a suffix that follows from the path alone: it stays when sources
+    come and go beside it.
+    """
+    each = list({os.path.abspath(source): source for source in sources}.items())
+    names = [_name(source.stem) for _, source in each]
+    often = Counter(name.casefold() for name in names)
+    return [
+        (
+            name if often[name.casefold()] == 1 else f"{name}-{sha256(os.fsencode(path)).hexdigest()[:8]}",
+            source,
+        )
+        for name, (path, source) in zip(names, each, strict=True)
+    ]
 
 
 def _name(text: str) -> str:

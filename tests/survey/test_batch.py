@@ -16,7 +16,7 @@ from mtpcr_geo.core.errors import InputError, OptionError, OutputError
 from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.survey.batch import run_batch
 from mtpcr_geo.survey.engine import _tried
-from mtpcr_geo.survey.jobs import jobs_of
+from mtpcr_geo.survey.jobs import Job, jobs_of
 from mtpcr_geo.survey.options import BatchOptions
 
 HERE = BatchOptions(workers=1)
@@ -86,6 +86,43 @@ def test_recordings_are_written_where_they_are_asked_for(clouds: Path) -> None:
 def test_a_name_is_no_path(tmp_path: Path) -> None:
     table = write_table(tmp_path, "name,source,target", "../../x y,a.laz,b.laz")
     assert jobs_of(table, None, {})[0].name == "_.._x_y"
+
+
+def test_every_source_is_a_job_whatever_it_is_called(tmp_path: Path) -> None:
+    files = (
+        "a/plot 1.laz",
+        "a/plot_1.laz",
+        "a/plot#1.LAZ",
+        "a/Scan.las",
+        "a/scan.laz",
+        "b/scan.laz",
+        "b/other.laz",
+    )
+    for name in files:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"LASF")
+
+    def names_of(*names: str) -> dict[str, str]:
+        (tmp_path / "list.txt").write_text("\n".join(names))
+        jobs = jobs_of(Path(f"@{tmp_path / 'list.txt'}"), tmp_path / "target.laz", {})
+        return {job.source.relative_to(tmp_path).as_posix(): job.name for job in jobs}
+
+    named = names_of(*files, files[0])
+    assert set(named) == set(files)
+    assert len({name.lower() for name in named.values()}) == len(files)
+    assert named["b/other.laz"] == "other"
+    assert all(name.startswith(("plot_1-", "scan-", "Scan-", "other")) for name in named.values())
+    # a name is the same whichever other sources of its kind there are
+    fewer = names_of("b/scan.laz", "a/scan.laz")
+    assert fewer == {name: named[name] for name in fewer}
+    assert names_of("b/scan.laz") == {"b/scan.laz": "scan"}
+
+
+def test_jobs_of_one_name_are_refused(tmp_path: Path) -> None:
+    jobs = [Job(name, Path("a.laz"), Path("b.laz"), {}) for name in ("One", "one")]
+    with pytest.raises(OptionError, match="2 jobs are called One"):
+        run_batch(jobs, tmp_path / "batch", HERE)
+    assert not (tmp_path / "batch").exists()
 
 
 def test_a_batch_runs_goes_on_and_tells_failures(clouds: Path, tmp_path: Path) -> None:
