@@ -27,7 +27,7 @@ from mtpcr_geo.core.wording import in_a_line
 from mtpcr_geo.registration import Registration, register
 from mtpcr_geo.survey import is_survey
 from mtpcr_geo.survey.earlier import remove_earlier
-from mtpcr_geo.survey.engine import engine_of
+from mtpcr_geo.survey.engine import SAME_PATHS, engine_of
 from mtpcr_geo.survey.index import write_atomic
 from mtpcr_geo.survey.jobs import Job
 from mtpcr_geo.survey.options import BatchOptions
@@ -134,7 +134,8 @@ def run_batch(
         MissingPartError: if more than one worker is wanted and Dask is not installed.
 
     """
-    folder = Path(folder)
+    # workers may run in other folders, and on other machines
+    folder, jobs = Path(folder).absolute(), [job.placed() for job in jobs]
     progress = progress or NoProgress()
     taken = Counter(job.name.casefold() for job in jobs)
     again = next((job.name for job in jobs if taken[job.name.casefold()] > 1), None)
@@ -156,6 +157,11 @@ def run_batch(
                 row = outcome.made
                 if row is None:
                     row = _without_result(outcome.item, _failed(outcome.item.job, outcome.error or ""))
+                elif row.folder and not _is_here(folder / row.folder):
+                    why = f"its worker wrote to another {folder / row.folder} than is here; {SAME_PATHS}"
+                    row = _without_result(outcome.item, _failed(outcome.item.job, why))
+                else:
+                    _write_row(folder, row)
                 rows[row.name] = row
                 advance(1)
     finally:
@@ -248,6 +254,12 @@ def _outline(sample: Floats) -> Floats:
     hull = xy[ConvexHull(xy).vertices]
     ring = np.vstack([hull, hull[:1]])
     return np.column_stack([ring, np.full(len(ring), sample[:, 2].mean())])
+
+
+def _is_here(folder: Path) -> bool:
+    """Return whether a folder that was just made is here too, on a network's file system as well."""
+    # a network's file system may hold for a while that there is none, until the folder above it is listed
+    return folder.is_dir() or (folder.parent.is_dir() and folder.name in os.listdir(folder.parent))
 
 
 def _row_path(folder: Path, name: str) -> Path:

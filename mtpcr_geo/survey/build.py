@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from zipfile import BadZipFile
@@ -27,7 +27,7 @@ from mtpcr_geo.io.formats import files_at, open_any
 from mtpcr_geo.io.no_returns import NoReturns, without
 from mtpcr_geo.method.bev import MAX_CELLS, choose_cell
 from mtpcr_geo.survey import is_survey
-from mtpcr_geo.survey.engine import engine_of
+from mtpcr_geo.survey.engine import SAME_PATHS, engine_of
 from mtpcr_geo.survey.index import (
     INDEX,
     Survey,
@@ -109,11 +109,12 @@ def build_survey(
         InputError: if no tile can be used.
         CrsError: if the tiles have no projected CRS.
         OptionError: if an option does not go with an existing survey.
-        OutputError: if the folder holds something else, or cannot be written.
+        OutputError: if the folder holds something else, cannot be written, or is another one on the workers.
         MissingPartError: if more than one worker is wanted and Dask is not installed.
 
     """
-    folder = Path(folder)
+    # workers may run in other folders, and on other machines
+    folder = Path(folder).absolute()
     progress = progress or NoProgress()
     named = [Tile.at(path) for name in tiles for path in files_at(Path(name))]
     named = list({tile.path: tile for tile in named}.values())
@@ -139,6 +140,7 @@ def build_survey(
         if not done:
             path, why = next(iter(failed.items()))
             raise InputError(f"none of the {len(named)} tiles can be used; the first, {path}: {why}")
+        _refuse_elsewhere(folder, [_part_of(folder, tile) for tile in done.values()], _parts_in(folder))
         survey = Survey(folder, frame).with_tiles(done.values())
         blocks = survey.blocks()
         merging = [_Merging(survey.mosaic, place, tuple(some)) for place, some in blocks.items()]
@@ -148,7 +150,10 @@ def build_survey(
                 if merged.error is not None:
                     raise OutputError(f"block {merged.item.place} cannot be made: {merged.error}")
                 advance(1)
-    for place in survey.mosaic.places():
+    there = survey.mosaic.places()
+    mosaic_of = survey.mosaic.path_of
+    _refuse_elsewhere(folder, map(mosaic_of, blocks), map(mosaic_of, there))
+    for place in there:
         if place not in blocks:
             survey.mosaic.remove(place)
     write_virtual(survey.mosaic, list(blocks))
@@ -168,6 +173,22 @@ def _refuse_links(folder: Path) -> None:
     if link is not None:
         raise OutputError(
             f"{short(link)} is a link, and a survey keeps its files in its own folder; remove it"
+        )
+
+
+def _refuse_elsewhere(folder: Path, wanted: Iterable[Path], found: Iterable[Path]) -> None:
+    """Refuse to go on where files that were written are not there, as workers see another folder.
+
+    Raises:
+        OutputError: naming the first.
+
+    """
+    there = set(found)
+    missing = [path for path in wanted if path not in there]
+    if missing:
+        raise OutputError(
+            f"{len(missing)} files of the survey, such as {short(missing[0].relative_to(folder))}, were "
+            f"written to another {short(folder)} than is here; {SAME_PATHS}"
         )
 
 
@@ -240,7 +261,7 @@ def _earlier(folder: Path, frame: Frame) -> dict[Path, Tile]:
     found: dict[Path, Tile] = {}
     if (folder / INDEX).is_file():
         found = {tile.path: tile for tile in Survey.open(folder).tiles}
-    for path in sorted((folder / _PARTS).glob("*.npz")):
+    for path in sorted(_parts_in(folder)):
         tile = _tile_in(path)
         if tile is not None:
             found[tile.path] = tile
@@ -249,6 +270,10 @@ def _earlier(folder: Path, frame: Frame) -> dict[Path, Tile]:
 
 def _is_read(known: Tile | None, tile: Tile, folder: Path) -> bool:
     return known is not None and known.state == tile.state and _part_of(folder, tile).is_file()
+
+
+def _parts_in(folder: Path) -> Iterator[Path]:
+    return (folder / _PARTS).glob("*.npz")
 
 
 def _part_of(folder: Path, tile: Tile) -> Path:

@@ -17,6 +17,7 @@ Item = TypeVar("Item")
 Made = TypeVar("Made")
 
 CONNECT_S = 30.0
+SAME_PATHS = "all workers must see the same folders, under the same paths, as this machine"
 
 
 @dataclass(frozen=True)
