@@ -53,6 +53,8 @@ class Job:
             "target": _states(self.target / INDEX if is_survey(self.target) else self.target),
             "options": dict(self.options),
         }
+        for name, path in _paths_in(self.options).items():
+            about[name] = [_state(one) for one in _at(path)]
         return sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()
 
     def placed(self, folder: str | os.PathLike[str] = "") -> Job:
@@ -179,6 +181,14 @@ def _paths_in(options: Mapping[str, Any]) -> dict[str, Path]:
     """Return the options that are a file or a folder."""
     found = {name: options[name] for name in _PATHS if isinstance(options.get(name), str | os.PathLike)}
     return {name: Path(value) for name, value in found.items() if name != "prior" or value not in PRIOR_WORDS}
+
+
+def _at(path: Path) -> list[Path]:
+    """Return the files of a folder; what is none is itself."""
+    try:
+        return sorted(path.iterdir()) if path.is_dir() else [path]
+    except OSError:
+        return [path]
 
 
 def _states(path: Path) -> list[tuple[str, int, int]]:

@@ -83,6 +83,44 @@ def test_recordings_are_written_where_they_are_asked_for(clouds: Path) -> None:
     assert [job.options for job in jobs_of(table, None, {"recording": True})] == [{"recording": True}] * 2
 
 
+def test_what_a_table_says_is_relative_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tab" / "poses").mkdir(parents=True)
+    pose = tmp_path / "tab" / "poses" / "1.txt"
+    pose.write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    table = write_table(
+        tmp_path / "tab",
+        "name,source,target,prior",
+        "a,a.laz,b.laz,poses/1.txt",
+        "b,@l.txt,,",
+        "c,c.laz,,georef",
+    )
+    relative = table.relative_to(tmp_path)
+    first, second, third = jobs_of(relative, Path("t.laz"), {"prior": "poses/2.txt", "models": "models"})
+    models = str(tmp_path / "models")
+    assert (first.source, first.target) == (tmp_path / "tab" / "a.laz", tmp_path / "tab" / "b.laz")
+    assert first.options == {"prior": str(pose), "models": models}
+    # what the command line says is relative to where it is given
+    assert (str(second.source), second.target) == (f"@{tmp_path / 'tab' / 'l.txt'}", tmp_path / "t.laz")
+    assert second.options == {"prior": str(tmp_path / "poses" / "2.txt"), "models": models}
+    assert third.options == {"prior": "georef", "models": models}
+
+
+def test_another_pose_known_beforehand_is_another_job(clouds: Path, tmp_path: Path) -> None:
+    (tmp_path / "models").mkdir()
+    pose = tmp_path / "pose.txt"
+    pose.write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    known = {"prior": str(pose), "models": str(tmp_path / "models")}
+    job = Job("a", clouds / "scan.laz", clouds / "target.laz", known)
+    first = job.key
+    assert job.key == first
+    pose.write_text("1 0 0 50\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    second = job.key
+    assert second != first
+    (tmp_path / "models" / "bev.onnx").write_bytes(b"weights")
+    assert job.key not in (first, second)
+
+
 def test_a_name_is_no_path(tmp_path: Path) -> None:
     table = write_table(tmp_path, "name,source,target", "../../x y,a.laz,b.laz")
     assert jobs_of(table, None, {})[0].name == "_.._x_y"
