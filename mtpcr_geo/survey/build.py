@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 import numpy as np
@@ -40,6 +41,9 @@ from mtpcr_geo.survey.index import (
 from mtpcr_geo.survey.mosaic import BLOCK_CELLS, BLOCKS, BlockRasteriser, Frame, Mosaic, Place, merge
 from mtpcr_geo.survey.options import BuildOptions
 from mtpcr_geo.survey.vrt import write_virtual
+
+if TYPE_CHECKING:
+    from pyproj import CRS
 
 MOST_BLOCKS = MAX_CELLS // BLOCK_CELLS**2
 DEFAULTS = BuildOptions()
@@ -215,7 +219,9 @@ def _frame(folder: Path, tiles: Sequence[Tile], options: BuildOptions) -> Frame:
         raise CrsError(
             f"a survey needs tiles in a projected CRS, and these are in {facts.name}; reproject them first"
         )
-    wkt = facts.horizontal.to_wkt() if facts.vertical is None else crs.to_wkt()
+    # where nothing is said of heights, not even their unit, the CRS in plan is all there is
+    plain = facts.height == "unsaid" and not facts.height_unit_stated
+    wkt = facts.horizontal.to_wkt() if plain else crs.to_wkt()
     cell = options.cell
     if cell is None:
         boxes = [np.maximum(head.maximum[:2] - head.minimum[:2], 1.0) * facts.unit for head in heads]
@@ -251,9 +257,23 @@ def _heads(tiles: Sequence[Tile]) -> list[Cloud]:
 
 def _check_crs(claimed: str, frame: Frame, what: str) -> None:
     crs = parse_crs(claimed)
-    if crs is None or not same_place(crs, frame.crs):
-        name = "local coordinates" if crs is None else crs.name
-        raise CrsError(f"{what} is {name}, and the survey is in {frame.crs.name}; reproject it first")
+    if crs is None:
+        raise CrsError(
+            f"{what} is local coordinates, and the survey is in {frame.crs.name}; reproject it first"
+        )
+    if not same_place(crs, frame.crs):
+        name, own = _told_apart(crs, frame.crs)
+        raise CrsError(f"{what} is {name}, and the survey is in {own}; reproject it first")
+
+
+def _told_apart(one: CRS, other: CRS) -> tuple[str, str]:
+    """Return names of two CRSs that are not one; with heights and their units where they are one in plan."""
+    first, second = facts_of(one), facts_of(other)
+    plans = (first.horizontal, second.horizontal)
+    if plans[0] is None or plans[1] is None or not same_place(plans[0], plans[1]):
+        return str(one.name), str(other.name)
+    heights = (f" with {facts.height_name} in {facts.height_unit_name}" for facts in (first, second))
+    return f"{plans[0].name}{next(heights)}", f"{plans[1].name}{next(heights)}"
 
 
 def _earlier(folder: Path, frame: Frame) -> dict[Path, Tile]:
@@ -287,7 +307,8 @@ def _rasterise(job: _Reading) -> Tile:
         problem = getattr(cloud, "crs_problem", "") or "it states none"
         raise CrsError(f"it has no CRS ({problem}); give --crs")
     if not same_place(cloud.crs, job.frame.crs):
-        raise CrsError(f"it is in {cloud.crs.name}, and the survey in {job.frame.crs.name}")
+        name, own = _told_apart(cloud.crs, job.frame.crs)
+        raise CrsError(f"it is in {name}, and the survey in {own}; reproject it first")
     blocks = BlockRasteriser(job.frame, MOST_BLOCKS, cloud.name)
     low, high, used = np.full(3, np.inf), np.full(3, -np.inf), 0
     none = NoReturns(0)

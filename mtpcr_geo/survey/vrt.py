@@ -35,7 +35,7 @@ def _virtual(mosaic: Mosaic, places: Sequence[Place], number: int, factor: int) 
     root = ElementTree.Element(
         "VRTDataset", rasterXSize=str((east - west) * side), rasterYSize=str((north - south) * side)
     )
-    ElementTree.SubElement(root, "SRS", dataAxisToSRSAxisMapping="1,2").text = frame.wkt
+    ElementTree.SubElement(root, "SRS", dataAxisToSRSAxisMapping="1,2").text = frame.raster_wkt
     placed = (west * edge, step, 0.0, north * edge, 0.0, -step)
     ElementTree.SubElement(root, "GeoTransform").text = ", ".join(f"{value:.17g}" for value in placed)
     about = ElementTree.SubElement(root, "Metadata")

@@ -11,9 +11,11 @@ from helpers_survey import digests, tiles_of, town_target, write_tile
 from pyproj import CRS
 
 from mtpcr_geo.core.errors import CrsError, InputError, OptionError, OutputError
+from mtpcr_geo.crs.facts import facts_of, same_place
 from mtpcr_geo.io.formats import open_any
 from mtpcr_geo.method.bev import coarsen, rasterise
 from mtpcr_geo.survey.build import build_survey
+from mtpcr_geo.survey.cut import cut_out
 from mtpcr_geo.survey.index import Survey
 from mtpcr_geo.survey.mosaic import BLOCK_CELLS, FACTORS
 from mtpcr_geo.survey.options import BuildOptions
@@ -194,3 +196,72 @@ def test_feet_are_told_by_the_crs(tmp_path: Path) -> None:
     low, high = survey.bounds[:, :2]
     assert west <= low[0] <= high[0] <= east
     assert south <= low[1] <= high[1] <= north
+
+
+UTM32 = CRS.from_epsg(25832)
+COMPOUND = 'COMPD_CS["{0}",{1},VERT_CS["{0}",VERT_DATUM["{0}",{2}],UNIT["{3}",{4}],AXIS["Up",UP]]]'
+PLAN = UTM32.to_wkt("WKT1_GDAL")
+FOOT = 1200 / 3937
+ELLIPSOIDAL = CRS.from_wkt(COMPOUND.format("Ellipsoid (metre)", PLAN, 2002, "metre", 1))
+UNNAMED_FEET = CRS.from_wkt(COMPOUND.format("unknown", PLAN, 2005, "US survey foot", FOOT))
+UNNAMED = CRS.from_wkt(COMPOUND.format("unknown", PLAN, 2005, "metre", 1))
+DHHN = CRS.from_user_input("EPSG:25832+7837")
+
+
+def flat_tile(path: Path, crs: CRS, east: float = 0.0) -> Path:
+    xyz = np.random.default_rng(0).uniform([0, 0, 10], [60, 60, 20], (3000, 3))
+    return write_tile(path, xyz + [500_000.0 + east, 5_800_000.0, 0.0], crs)
+
+
+@pytest.mark.parametrize(
+    ("crs", "height", "unit"),
+    [
+        (UTM32, "unsaid", 1.0),
+        (UTM32.to_3d(), "ellipsoidal", 1.0),
+        (ELLIPSOIDAL, "ellipsoidal", 1.0),
+        (UNNAMED_FEET, "unsaid", FOOT),
+        (UNNAMED, "unsaid", 1.0),
+        (DHHN, "datum", 1.0),
+    ],
+    ids=["plan", "3D", "ellipsoidal", "unnamed, feet", "unnamed", "named"],
+)
+def test_heights_are_what_the_tiles_say_of_them(crs: CRS, height: str, unit: float, tmp_path: Path) -> None:
+    tiles = [flat_tile(tmp_path / f"{east}.laz", crs, east) for east in (0, 50)]
+    first = build_survey(tiles[:1], tmp_path / "survey", BuildOptions(workers=1, cell=1.0))
+    # what the survey keeps is what the next tiles are held to
+    both = build_survey(tiles[1:], tmp_path / "survey", BuildOptions(workers=1))
+    assert not first.failed
+    assert not both.failed
+    survey = Survey.open(tmp_path / "survey")
+    cut = cut_out(survey, survey.bounds[:, :2])
+    facts = facts_of(cut.crs)
+    assert (facts.height, facts.height_unit) == (height, pytest.approx(unit))
+    assert cut.count == 6000
+    tops = survey.mosaic.read(survey.bounds[:, :2], 1).top
+    assert np.nanmax(tops) == pytest.approx(20.0 * unit, abs=0.02)
+    with rasterio.open(survey.folder / "top_1m.vrt") as opened:
+        assert np.nanmax(opened.read(1)) == np.nanmax(tops)
+        # the rasters' heights are metres, whatever the tiles' are
+        assert "foot" not in opened.crs.to_wkt()
+    with rasterio.open(survey.mosaic.path_of(survey.mosaic.places()[0])) as opened:
+        plan = facts_of(CRS.from_wkt(opened.crs.to_wkt())).horizontal
+        assert plan is not None
+        assert same_place(plan, UTM32)
+        assert "foot" not in opened.crs.to_wkt()
+
+
+def test_tiles_that_differ_in_heights_are_told_so(tmp_path: Path) -> None:
+    plain, solid, feet = (
+        flat_tile(tmp_path / f"{name}.laz", crs)
+        for name, crs in (("plain", DHHN), ("solid", UTM32.to_3d()), ("feet", UNNAMED_FEET))
+    )
+    built = build_survey([plain, solid, feet], tmp_path / "survey", BuildOptions(workers=1, cell=1.0))
+    own = "the survey in ETRS89 / UTM zone 32N with DHHN2016 height in metre"
+    for tile, says in (
+        (solid, "ellipsoidal height in metre"),
+        (feet, "heights of no stated datum in US survey"),
+    ):
+        assert f"ETRS89 / UTM zone 32N with {says}" in built.failed[tile]
+        assert own in built.failed[tile]
+    with pytest.raises(CrsError, match=r"--crs EPSG:25832 is .* with heights of no stated datum"):
+        build_survey([plain], tmp_path / "survey", BuildOptions(workers=1, crs="EPSG:25832"))
