@@ -63,6 +63,11 @@ def run(options: SurveyVerb) -> None:
             f"{survey.frame.cell_m:g} m in {survey.frame.crs.name}; {built.read} tiles read and "
             f"{built.merged} blocks written now"
         )
+    if built.gone:
+        warn(
+            f"{len(built.gone)} tiles of the survey are no longer there, such as {built.gone[0]}; name all "
+            "that it shall have, and give --prune, to leave these out"
+        )
     if built.failed:
         for path, why in list(built.failed.items())[:MOST_NAMED]:
             warn(f"{path}: {why}")

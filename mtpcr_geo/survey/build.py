@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -60,6 +60,7 @@ class Built:
         read: tiles whose points were read.
         merged: blocks that were written.
         failed: tiles that could not be used, and why.
+        gone: tiles that stay in the survey, were not named now, and whose files are no longer there.
 
     """
 
@@ -67,6 +68,7 @@ class Built:
     read: int
     merged: int
     failed: dict[Path, str]
+    gone: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -127,8 +129,10 @@ def build_survey(
     _refuse_links(folder)
     frame = _frame(folder, named, options)
     kept = _earlier(folder, frame)
+    gone: list[Tile] = []
     if not options.prune:
-        named += [tile for path, tile in kept.items() if path not in {one.path for one in named}]
+        others, gone = _not_named(named, kept)
+        named += [*others, *gone]
     wanted = [tile for tile in named if not _is_read(kept.get(tile.path), tile, folder)]
     failed: dict[Path, str] = {}
     done = {tile.path: kept[tile.path] for tile in named if tile not in wanted}
@@ -163,7 +167,20 @@ def build_survey(
     write_virtual(survey.mosaic, list(blocks))
     survey.write_index()
     _remove_parts(survey)
-    return Built(survey, len(wanted) - len(failed), len(stale), failed)
+    missing = tuple(tile.path for tile in gone if tile.path in done)
+    return Built(survey, len(wanted) - len(failed), len(stale), failed, missing)
+
+
+def _not_named(named: Sequence[Tile], kept: Mapping[Path, Tile]) -> tuple[list[Tile], list[Tile]]:
+    """Return the tiles of a survey that are not named now, as they are: those there, and those gone."""
+    there: list[Tile] = []
+    gone: list[Tile] = []
+    for path in sorted(kept.keys() - {tile.path for tile in named}):
+        try:
+            there.append(Tile.at(path))
+        except InputError:
+            gone.append(kept[path])
+    return there, gone
 
 
 def _refuse_links(folder: Path) -> None:

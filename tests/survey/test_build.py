@@ -123,6 +123,23 @@ def test_only_what_is_new_or_changed_is_read(tiles: list[Path], tmp_path: Path) 
     assert len(pruned.survey.mosaic.places()) == len(pruned.survey.tiles[0].blocks)
 
 
+def test_a_tile_that_is_gone_is_named_and_pruned(tiles: list[Path], tmp_path: Path) -> None:
+    own = [Path(shutil.copy2(tile, tmp_path)) for tile in tiles]
+    survey = build_survey(own, tmp_path / "survey", HERE).survey
+    box = survey.bounds[:, :2]
+    own[0].rename(tmp_path / "moved.laz")
+    write_tile(own[1], points_of(own[1:2])[:1000])
+    with pytest.raises(InputError, match=r"tile0\.laz .* is no longer there; .* --prune"):
+        cut_out(survey, box)
+    # what has changed is read again though it is not named; what is gone stays, and is said
+    again = build_survey(own[2:], tmp_path / "survey", HERE)
+    assert (again.read, again.gone, len(again.survey.tiles)) == (1, (own[0],), 4)
+    named = [*own[1:], tmp_path / "moved.laz"]
+    pruned = build_survey(named, tmp_path / "survey", HERE.model_copy(update={"prune": True}))
+    assert (pruned.read, pruned.gone) == (1, ())
+    assert cut_out(pruned.survey, box).count == len(points_of(named))
+
+
 def test_a_build_that_was_stopped_goes_on_to_the_same_bits(
     built: Survey, tiles: list[Path], tmp_path: Path
 ) -> None:
