@@ -53,7 +53,7 @@ class Row:
         verdict: accepted, doubtful or refused; "failed" where it could not be run to a verdict.
         probability: of being right, where there is a verdict by a model.
         margin, null_ratio: strength over the next distinct pose, and over the mirrored source.
-        x, y: where the middle of the source lies, in the target's CRS.
+        x, y: where the middle of the source lies, the mean of its points, in the target's CRS.
         yaw_deg: yaw of the transform.
         sigma_plan_m: standard deviation of the place, metres.
         seconds: wall time of the job.
@@ -231,9 +231,11 @@ def _judged(job: Job, result: Registration) -> Row:
     )
     if pair is None or T is None or pair.T_target_source is None:
         return row
-    outline = _outline(pair.source.sample)
-    placed = pair.target.link.to_file(transforms.apply(pair.T_target_source, outline))
-    x, y = placed[:-1, :2].mean(axis=0)
+    sample = pair.source.sample
+    # the middle is what --near takes for it: the mean of the points
+    marks = np.vstack([_outline(sample), sample.mean(axis=0)])
+    *placed, middle = pair.target.link.to_file(transforms.apply(pair.T_target_source, marks))
+    x, y = middle[:2]
     crs = pair.target.link.file_crs
     return replace(
         row,
@@ -241,7 +243,7 @@ def _judged(job: Job, result: Registration) -> Row:
         y=float(y),
         yaw_deg=float(np.degrees(transforms.yaw_of(pair.T_target_source[:3, :3]))),
         T_target_source=tuple(float(value) for value in T.ravel()),
-        footprint=tuple(float(value) for value in placed[:, :2].ravel()),
+        footprint=tuple(float(value) for point in placed for value in point[:2]),
         crs="" if crs is None else crs.to_wkt(),
     )
 
