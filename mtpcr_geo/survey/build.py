@@ -8,6 +8,7 @@ is killed goes on where it stopped, and gives the same bits.
 from __future__ import annotations
 
 import io
+import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,9 +32,11 @@ from mtpcr_geo.survey import is_survey
 from mtpcr_geo.survey.engine import SAME_PATHS, engine_of
 from mtpcr_geo.survey.index import (
     INDEX,
+    PLACE,
     Survey,
     Tile,
     date_of,
+    dimensions_of,
     read_frame,
     write_atomic,
     write_frame,
@@ -342,7 +345,13 @@ def _rasterise(job: _Reading) -> Tile:
     made = blocks.finish()
     bounds = tuple(float(value) for value in (*low, *high)) if used else (0.0,) * 6
     tile = replace(
-        job.tile, points=cloud.count, used=used, bounds=bounds, blocks=tuple(made), date=date_of(cloud)
+        job.tile,
+        points=cloud.count,
+        used=used,
+        bounds=bounds,
+        blocks=tuple(made),
+        date=date_of(cloud),
+        dimensions=dimensions_of(cloud),
     )
     if not job.tile.unchanged():
         raise InputError(f"{tile.path} changed while it was read; run survey build again")
@@ -363,6 +372,7 @@ def _write_part(path: Path, tile: Tile, blocks: dict[Place, Bev]) -> None:
         "bounds": np.array(tile.bounds),
         "blocks": np.array(tile.blocks, np.int64).reshape(-1, 2),
         "date": np.array(tile.date or ""),
+        "dimensions": np.array(json.dumps(tile.dimensions)),
     }
     for (column, row), bev in blocks.items():
         filled = bev.count > 0
@@ -402,6 +412,8 @@ def _tile_in(path: Path) -> Tile | None:
             size, modified, points, used = (int(value) for value in held["numbers"])
             bounds = tuple(float(value) for value in held["bounds"])
             blocks = tuple((int(c), int(r)) for c, r in held["blocks"])
+            # builds of earlier versions did not keep them
+            kept = json.loads(str(held["dimensions"])) if "dimensions" in held else ()
             return Tile(
                 Path(str(held["path"])),
                 size,
@@ -411,8 +423,9 @@ def _tile_in(path: Path) -> Tile | None:
                 bounds,
                 blocks,
                 str(held["date"]) or None,
+                tuple((str(name), str(kind), int(size)) for name, kind, size in kept) or PLACE,
             )
-    except (OSError, ValueError, KeyError, BadZipFile):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, BadZipFile):
         return None
 
 

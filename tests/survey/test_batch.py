@@ -178,6 +178,8 @@ def test_a_batch_runs_goes_on_and_tells_failures(clouds: Path, tmp_path: Path) -
     gap = transforms.apply(T, middle) - transforms.apply(town_source()[1], middle)
     assert np.linalg.norm(gap) < 0.2
     # the middle is the mean of the points, as --near means it, and not that of the outline's corners
+    assert good.x is not None
+    assert good.y is not None
     np.testing.assert_allclose([good.x, good.y], transforms.apply(T, middle)[0, :2], atol=0.01)
     ring = np.reshape(good.footprint, (-1, 2))
     assert np.linalg.norm(ring[:-1].mean(axis=0) - [good.x, good.y]) > 1.0

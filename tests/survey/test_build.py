@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 import rasterio
@@ -95,6 +97,58 @@ def test_the_index_is_a_virtual_point_cloud(built: Survey, tiles: list[Path]) ->
     assert again == built
     assert all(tile.unchanged() for tile in again.tiles)
     assert all(tile.date for tile in again.tiles)
+
+
+def test_the_index_is_what_qgis_and_pdal_wrench_read(built: Survey, tiles: list[Path]) -> None:
+    index = json.loads((built.folder / "index.vpc").read_text(encoding="utf-8"))
+    for feature, tile in zip(index["features"], built.tiles, strict=True):
+        href = feature["assets"]["data"]["href"]
+        # nothing else is resolved against the folder of the index
+        assert href.startswith("./")
+        assert (built.folder / href).resolve() == tile.path
+        about = feature["properties"]
+        west, south, _, east, north, _ = about["proj:bbox"]
+        ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+        assert about["proj:geometry"] == {"type": "Polygon", "coordinates": [ring]}
+        schemas = {one["name"]: (one["type"], one["size"]) for one in about["pc:schemas"]}
+        assert schemas["X"] == schemas["Z"] == schemas["GpsTime"] == ("floating", 8)
+        assert schemas["Intensity"] == schemas["PointSourceId"] == ("unsigned", 2)
+        assert schemas["Classification"] == schemas["ReturnNumber"] == ("unsigned", 1)
+        assert schemas["ScanAngleRank"] == ("floating", 4)
+        table = next(iter(open_any(tile.path).table_chunks(10)))
+        assert list(schemas) == list(table)
+
+
+def test_indices_of_earlier_builds_are_read(built: Survey, tiles: list[Path], tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(built.folder, tmp_path / "survey"))
+    index = json.loads((folder / "index.vpc").read_text(encoding="utf-8"))
+    for feature, tile in zip(index["features"], built.tiles, strict=True):
+        feature["assets"]["data"]["href"] = os.path.relpath(tile.path, folder)
+        del feature["properties"]["pc:schemas"], feature["properties"]["proj:geometry"]
+    (folder / "index.vpc").write_text(json.dumps(index), encoding="utf-8")
+    assert open_any(folder / "index.vpc").count == len(points_of(tiles))
+    assert [tile.path for tile in Survey.open(folder).tiles] == [tile.path for tile in built.tiles]
+    # they are told more of a tile where it was kept, and nothing is read again for it
+    again = build_survey(tiles, folder, HERE)
+    assert again.read == 0
+    assert again.survey.tiles == built.tiles
+
+
+def test_the_dimensions_of_points_are_those_of_their_files(tmp_path: Path) -> None:
+    xyz = np.random.default_rng(0).uniform([0, 0, 0], [50, 50, 9], (100, 3))
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.add_extra_dim(laspy.ExtraBytesParams("height", "3f4"))
+    las = laspy.LasData(header)
+    las.xyz = xyz
+    las.write(tmp_path / "extra.las")
+    np.save(tmp_path / "plain.npy", xyz)
+    options = BuildOptions(workers=1, cell=1.0, crs="EPSG:25832")
+    tiles = [tmp_path / "extra.las", tmp_path / "plain.npy"]
+    extra, plain = build_survey(tiles, tmp_path / "survey", options).survey.tiles
+    assert plain.dimensions == (("X", "floating", 8), ("Y", "floating", 8), ("Z", "floating", 8))
+    assert {("Red", "unsigned", 2), ("height0", "floating", 4), ("height2", "floating", 4)} <= {
+        *extra.dimensions
+    }
 
 
 def test_only_what_is_new_or_changed_is_read(tiles: list[Path], tmp_path: Path) -> None:
