@@ -4,23 +4,27 @@ import json
 import os
 import shutil
 from pathlib import Path
+from xml.etree import ElementTree
 
 import laspy
 import numpy as np
 import pytest
 import rasterio
+import rasterio.shutil
 from helpers_survey import digests, tiles_of, town_target, write_tile
 from pyproj import CRS
 
 from mtpcr_geo.core.errors import CrsError, InputError, OptionError, OutputError
+from mtpcr_geo.core.types import Bev
 from mtpcr_geo.crs.facts import facts_of, same_place
 from mtpcr_geo.io.formats import open_any
 from mtpcr_geo.method.bev import coarsen, rasterise
 from mtpcr_geo.survey.build import build_survey
 from mtpcr_geo.survey.cut import cut_out
 from mtpcr_geo.survey.index import Survey
-from mtpcr_geo.survey.mosaic import BLOCK_CELLS, FACTORS
+from mtpcr_geo.survey.mosaic import BLOCK_CELLS, FACTORS, Frame, Mosaic
 from mtpcr_geo.survey.options import BuildOptions
+from mtpcr_geo.survey.vrt import write_virtual
 
 HERE = BuildOptions(workers=1, cell=0.25)
 
@@ -81,6 +85,30 @@ def test_virtual_rasters_are_the_mosaic(built: Survey) -> None:
         held = ~np.isnan(seen)
         np.testing.assert_array_equal(seen[held], expected[held])
         assert not bev.count[~held].any()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["EPSG:25832", "EPSG:2180", "EPSG:2193", "EPSG:3006", "EPSG:31467", "EPSG:3031", "EPSG:32661",
+     "EPSG:32761", "EPSG:5042", "EPSG:2225", "EPSG:25832+7837", "EPSG:2180+9651"],
+)  # fmt: skip
+def test_virtual_rasters_have_the_axes_that_gdal_gives_them(name: str, tmp_path: Path) -> None:
+    crs = CRS.from_user_input(name)
+    mosaic = Mosaic(tmp_path, Frame(crs.to_wkt(), 1.0))
+    grid = mosaic.frame.grid_of((1000, 2000))
+    filled = np.zeros(grid.shape, np.float32)
+    mosaic.write((1000, 2000), Bev(grid, filled, filled, np.ones(grid.shape, np.uint32)), "")
+    write_virtual(mosaic, [(1000, 2000)])
+    by_gdal = tmp_path / "by_gdal.vrt"
+    rasterio.shutil.copy(mosaic.path_of((1000, 2000)), by_gdal, driver="VRT")
+    ours, theirs = (ElementTree.parse(path).find("SRS") for path in (tmp_path / "top_1m.vrt", by_gdal))
+    assert ours is not None
+    assert theirs is not None
+    assert ours.attrib == theirs.attrib
+    with rasterio.open(tmp_path / "top_1m.vrt") as one, rasterio.open(by_gdal) as other:
+        assert one.crs == other.crs
+        assert one.transform == other.transform
+        assert one.bounds == other.bounds
 
 
 def test_blocks_are_cloud_optimised(built: Survey) -> None:
