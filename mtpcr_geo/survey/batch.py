@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from mtpcr_geo.core.arrays import Floats
+    from mtpcr_geo.export.geopackage import Layer
 
 TABLE, MAP, MARK = "batch.csv", "batch.gpkg", "batch.json"
 _ROWS, _JOBS = "rows", "jobs"
@@ -320,31 +321,57 @@ def write_table(path: Path, rows: Sequence[Row]) -> Path:
 def write_map(path: Path, rows: Sequence[Row]) -> Path:
     """Write the outlines of the sources where they were placed, with verdict and probability, as GeoPackage.
 
-    The map is in the CRS of the first target; what was placed in another is brought there.
+    The layer ``footprints`` is in the CRS of the first target that has one; what was placed in another is
+    brought there. Outlines in targets without a CRS have a layer of their own, ``footprints_local``.
+
+    Args:
+        path: the file; one that is there is replaced.
+        rows: of the batch; those that were not placed are left out.
+
+    Returns:
+        The file.
+
+    Raises:
+        OutputError: if it cannot be written.
+
     """
     from pyproj import CRS
 
-    from mtpcr_geo.export.geopackage import Layer, write_geopackage
+    from mtpcr_geo.export.geopackage import write_geopackage
 
-    placed = [row for row in rows if row.footprint]
-    crs = CRS.from_wkt(placed[0].crs) if placed and placed[0].crs else None
-    shown = [row for row in placed if bool(row.crs) == (crs is not None)]
-    fields = {
-        name: np.array([getattr(row, name) for row in shown], np.str_)
-        for name in ("name", "verdict", "source", "target", "reason", "folder")
-    } | {
-        name: np.array([np.nan if getattr(row, name) is None else getattr(row, name) for row in shown])
-        for name in ("probability", "margin", "null_ratio", "yaw_deg", "sigma_plan_m", "seconds")
-    }
-    outlines = [_in_crs(row, crs) for row in shown]
-    layer = Layer("footprints", "POLYGON", outlines, fields, "outlines of the sources where they were placed")
+    placed = [row for row in rows if row.footprint and row.crs]
+    local = [row for row in rows if row.footprint and not row.crs]
+    crs = CRS.from_wkt(placed[0].crs) if placed else None
+    layers = []
+    if placed or not local:
+        layers.append(_layer("footprints", placed, crs))
+    if local:
+        layers.append(_layer("footprints_local", local, None))
     part = path.with_name(f".{path.stem}.part-{os.getpid()}{path.suffix}")
     try:
-        write_geopackage(part, [layer], crs)
+        write_geopackage(part, layers, crs)
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
     return path
+
+
+def _layer(name: str, rows: Sequence[Row], crs: CRS | None) -> Layer:
+    """Return outlines with what the table says of them, in a CRS; or local, each in its target's frame."""
+    from mtpcr_geo.export.geopackage import Layer
+
+    fields = {
+        field: np.array([getattr(row, field) for row in rows], np.str_)
+        for field in ("name", "verdict", "source", "target", "reason", "folder")
+    } | {
+        field: np.array([np.nan if getattr(row, field) is None else getattr(row, field) for row in rows])
+        for field in ("probability", "margin", "null_ratio", "yaw_deg", "sigma_plan_m", "seconds")
+    }
+    outlines = [_in_crs(row, crs) for row in rows]
+    about = "outlines of the sources where they were placed"
+    if crs is None and rows:
+        about = f"{about}, in the coordinates of targets without a CRS"
+    return Layer(name, "POLYGON", outlines, fields, about, local=crs is None)
 
 
 def _in_crs(row: Row, crs: CRS | None) -> Floats:

@@ -3,18 +3,20 @@ from __future__ import annotations
 import csv
 import json
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers_survey import town_source, town_target, write_tile
+from pyproj import CRS
 from typer.testing import CliRunner
 
 from mtpcr_geo.cli.app import app
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import InputError, OptionError, OutputError
 from mtpcr_geo.core.system import usable_cores
-from mtpcr_geo.survey.batch import run_batch
+from mtpcr_geo.survey.batch import Row, run_batch, write_map
 from mtpcr_geo.survey.engine import _tried
 from mtpcr_geo.survey.jobs import Job, jobs_of
 from mtpcr_geo.survey.options import BatchOptions
@@ -204,6 +206,23 @@ def test_a_batch_runs_goes_on_and_tells_failures(clouds: Path, tmp_path: Path) -
     # another option is another job
     other = jobs_of(table, None, {"source_crs": "local", "seed": 1})
     assert other[0].key != jobs[0].key
+
+
+@pytest.mark.parametrize("kinds", ["glg", "lgg", "ll", "gg", ""])
+def test_whatever_was_placed_is_on_the_map(kinds: str, tmp_path: Path) -> None:
+    wkts = {"l": "", "g": CRS.from_epsg(25832).to_wkt()}
+    ring = (0.0, 0.0, 9.0, 0.0, 9.0, 9.0, 0.0, 0.0)
+    rows = [
+        Row(f"{kind}{number}", "s", "t", "accepted", footprint=ring, crs=wkts[kind])
+        for number, kind in enumerate(kinds)
+    ]
+    path = write_map(tmp_path / "map.gpkg", [*rows, Row("none", "s", "t", "failed")])
+    found: dict[str, int] = {}
+    with closing(sqlite3.connect(path)) as base:
+        for layer, srs in base.execute("SELECT table_name, srs_id FROM gpkg_geometry_columns").fetchall():
+            assert srs == (-1 if layer == "footprints_local" or not kinds else 25832)
+            found |= {name: srs for (name,) in base.execute(f"SELECT name FROM {layer}")}
+    assert found == {row.name: 25832 if row.crs else -1 for row in rows}
 
 
 def test_a_foreign_folder_is_left_alone(clouds: Path, tmp_path: Path) -> None:
