@@ -59,9 +59,14 @@ def run(options: SurveyVerb) -> None:
     if not options.quiet:
         points = sum(tile.used for tile in survey.tiles)
         say(
-            f"{in_a_line(survey.folder)}: {len(survey.tiles)} tiles, {points:,} points, cells of "
+            f"{in_a_line(options.out)}: {len(survey.tiles)} tiles, {points:,} points, cells of "
             f"{survey.frame.cell_m:g} m in {survey.frame.crs.name}; {built.read} tiles read and "
             f"{built.merged} blocks written now"
+        )
+    if built.gone:
+        warn(
+            f"{len(built.gone)} tiles of the survey are no longer there, such as {built.gone[0]}; name all "
+            "that it shall have, and give --prune, to leave these out"
         )
     if built.failed:
         for path, why in list(built.failed.items())[:MOST_NAMED]:

@@ -73,6 +73,7 @@ class Layer:
         fields: attributes by name, each (n,): bool, integer, float (NaN becomes NULL) or text.
         description: what the layer shows, for the reader's layer properties.
         style: a QML that QGIS applies by default, or "".
+        local: whether its coordinates are local, in a file whose other layers are in a CRS.
 
     """
 
@@ -82,6 +83,7 @@ class Layer:
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     description: str = ""
     style: str = ""
+    local: bool = False
 
 
 def write_geopackage(path: str | Path, layers: Iterable[Layer], crs: CRS | None) -> None:
@@ -90,7 +92,8 @@ def write_geopackage(path: str | Path, layers: Iterable[Layer], crs: CRS | None)
     Args:
         path: where to write.
         layers: what to write; a layer without geometries becomes an empty table.
-        crs: of all layers, or None for local coordinates ("undefined Cartesian" in the file).
+        crs: of all layers that are not local, or None for local coordinates ("undefined Cartesian" in the
+            file).
 
     Raises:
         OutputError: if the file cannot be written.
@@ -108,7 +111,7 @@ def write_geopackage(path: str | Path, layers: Iterable[Layer], crs: CRS | None)
             base.executescript(_SCHEMA)
             srs = _add_srs(base, crs)
             for layer in layers:
-                _add_layer(base, layer, srs)
+                _add_layer(base, layer, _UNDEFINED_CARTESIAN if layer.local else srs)
             _register(base, "layer_styles", "attributes", "styles that QGIS applies", None, 0)
     except (sqlite3.Error, OSError) as error:
         raise OutputError(f"cannot write {path}: {error}") from error

@@ -137,6 +137,19 @@ def is_many(path: str | Path) -> bool:
     return glob.has_magic(text)
 
 
+def placed(name: str | os.PathLike[str], folder: str | os.PathLike[str] = "") -> Path:
+    """Return a name of clouds that reads the same in any folder: absolute, links not followed.
+
+    Args:
+        name: of a file, a folder, a pattern, or ``@`` and a list.
+        folder: what it is relative to; the present one if not given.
+
+    """
+    text = os.fspath(name)
+    mark = LIST_MARK if text.startswith(LIST_MARK) else ""
+    return Path(f"{mark}{Path(folder, text.removeprefix(mark)).absolute()}")
+
+
 def files_of(path: str | Path, is_cloud: Callable[[Path], bool]) -> list[Path]:
     """Return the files that a path names, in the order of their names, or of the list.
 

@@ -11,6 +11,7 @@ import io
 import json
 import os
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,13 +20,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mtpcr_geo.core import transforms
-from mtpcr_geo.core.errors import InputError, MtpcrError, OutputError, RegistrationError
+from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError, OutputError, RegistrationError
 from mtpcr_geo.core.paths import link_among, read_whole
 from mtpcr_geo.core.progress import NoProgress, Progress
 from mtpcr_geo.core.wording import in_a_line
 from mtpcr_geo.registration import Registration, register
 from mtpcr_geo.survey import is_survey
-from mtpcr_geo.survey.engine import engine_of
+from mtpcr_geo.survey.earlier import remove_earlier
+from mtpcr_geo.survey.engine import SAME_PATHS, engine_of
 from mtpcr_geo.survey.index import write_atomic
 from mtpcr_geo.survey.jobs import Job
 from mtpcr_geo.survey.options import BatchOptions
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from mtpcr_geo.core.arrays import Floats
+    from mtpcr_geo.export.geopackage import Layer
 
 TABLE, MAP, MARK = "batch.csv", "batch.gpkg", "batch.json"
 _ROWS, _JOBS = "rows", "jobs"
@@ -51,12 +54,12 @@ class Row:
         verdict: accepted, doubtful or refused; "failed" where it could not be run to a verdict.
         probability: of being right, where there is a verdict by a model.
         margin, null_ratio: strength over the next distinct pose, and over the mirrored source.
-        x, y: where the middle of the source lies, in the target's CRS.
+        x, y: where the middle of the source lies, the mean of its points, in the target's CRS.
         yaw_deg: yaw of the transform.
         sigma_plan_m: standard deviation of the place, metres.
         seconds: wall time of the job.
         reason: the first reason of the verdict, or the error.
-        folder: of the job's files, relative to the batch.
+        folder: of the job's files, relative to the batch; "" where it left none.
         T_target_source: 4x4 between the coordinates of the files, row by row; empty where none was found.
         footprint: outline of the source in the target's CRS, x and y in turns.
         crs: the target's CRS as WKT; "" where it is local.
@@ -127,12 +130,18 @@ def run_batch(
         progress: receives the number of jobs done.
 
     Raises:
+        OptionError: if jobs share a name, upper and lower case taken as one.
         OutputError: if the folder holds something else, or cannot be written.
         MissingPartError: if more than one worker is wanted and Dask is not installed.
 
     """
-    folder = Path(folder)
+    # workers may run in other folders, and on other machines
+    folder, jobs = Path(folder).absolute(), [job.placed() for job in jobs]
     progress = progress or NoProgress()
+    taken = Counter(job.name.casefold() for job in jobs)
+    again = next((job.name for job in jobs if taken[job.name.casefold()] > 1), None)
+    if again is not None:
+        raise OptionError(f"{taken[again.casefold()]} jobs are called {again}; give each a name of its own")
     foreign = os.path.exists(folder) and not os.path.isfile(folder / MARK)
     if foreign and not options.overwrite and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder} is there already, and is no batch; name another folder, or --overwrite")
@@ -140,14 +149,19 @@ def run_batch(
     if link is not None:
         raise OutputError(f"{link} is a link, and a batch keeps its files in its own folder; remove it")
     write_atomic(folder / MARK, json.dumps({"format": "mtpcr-geo batch", "version": 1}))
+    # an earlier row of a job that has changed since says nothing of it
     rows = {job.name: _row_of(folder, job) for job in jobs}
-    left = [_Task(job, folder) for job in jobs if _is_left(rows[job.name], job, options)]
+    left = [_Task(job, folder) for job in jobs if _is_left(rows[job.name], options)]
     try:
         with engine_of(options, max(len(left), 1)) as engine, progress.task("jobs", len(left)) as advance:
             for outcome in engine.run(do, left, options.retries):
                 row = outcome.made
                 if row is None:
-                    row = _failed(outcome.item.job, outcome.error or "")
+                    row = _without_result(outcome.item, _failed(outcome.item.job, outcome.error or ""))
+                elif row.folder and not _is_here(folder / row.folder):
+                    why = f"its worker wrote to another {folder / row.folder} than is here; {SAME_PATHS}"
+                    row = _without_result(outcome.item, _failed(outcome.item.job, why))
+                else:
                     _write_row(folder, row)
                 rows[row.name] = row
                 advance(1)
@@ -167,20 +181,34 @@ def do(task: _Task) -> Row:
         # what an earlier try of this job left gives way
         run_one = register_in_survey if is_survey(job.target) else register
         result = run_one(job.source, job.target, folder, overwrite=True, **given)
-        row = _judged(job, result)
     except RegistrationError as error:
         # a survey that has no place for it refuses it, as a target does
         row = replace(_failed(job, str(error)), verdict="refused")
+        return _without_result(task, row, started)
     except MtpcrError as error:
-        row = _failed(job, f"{type(error).__name__}: {error}")
+        return _without_result(task, _failed(job, f"{type(error).__name__}: {error}"), started)
     seconds = round(time.perf_counter() - started, 3)
-    row = replace(row, seconds=seconds, folder=f"{_JOBS}/{job.name}" if folder.is_dir() else "")
+    row = replace(_judged(job, result), seconds=seconds, folder=f"{_JOBS}/{job.name}")
     _write_row(task.folder, row)
     return row
 
 
-def _is_left(row: Row | None, job: Job, options: BatchOptions) -> bool:
-    return row is None or row.failed or options.overwrite or row.key != job.key
+def _without_result(task: _Task, row: Row, started: float | None = None) -> Row:
+    """Write the row of a job that left no result, and remove that of an earlier run of another input."""
+    seconds = 0.0 if started is None else round(time.perf_counter() - started, 3)
+    row = replace(row, seconds=seconds, folder="")
+    # the row comes first: whatever ends this, the table claims no result that is another's
+    _write_row(task.folder, row)
+    try:
+        remove_earlier(task.folder / _JOBS / task.job.name, (task.job.source, task.job.target))
+    except OutputError as error:
+        row = replace(row, reason=f"{row.reason}; and an earlier result stays: {error}")
+        _write_row(task.folder, row)
+    return row
+
+
+def _is_left(row: Row | None, options: BatchOptions) -> bool:
+    return row is None or row.failed or options.overwrite
 
 
 def _failed(job: Job, why: str) -> Row:
@@ -204,9 +232,11 @@ def _judged(job: Job, result: Registration) -> Row:
     )
     if pair is None or T is None or pair.T_target_source is None:
         return row
-    outline = _outline(pair.source.sample)
-    placed = pair.target.link.to_file(transforms.apply(pair.T_target_source, outline))
-    x, y = placed[:-1, :2].mean(axis=0)
+    sample = pair.source.sample
+    # the middle is what --near takes for it: the mean of the points
+    marks = np.vstack([_outline(sample), sample.mean(axis=0)])
+    *placed, middle = pair.target.link.to_file(transforms.apply(pair.T_target_source, marks))
+    x, y = middle[:2]
     crs = pair.target.link.file_crs
     return replace(
         row,
@@ -214,7 +244,7 @@ def _judged(job: Job, result: Registration) -> Row:
         y=float(y),
         yaw_deg=float(np.degrees(transforms.yaw_of(pair.T_target_source[:3, :3]))),
         T_target_source=tuple(float(value) for value in T.ravel()),
-        footprint=tuple(float(value) for value in placed[:, :2].ravel()),
+        footprint=tuple(float(value) for point in placed for value in point[:2]),
         crs="" if crs is None else crs.to_wkt(),
     )
 
@@ -229,6 +259,12 @@ def _outline(sample: Floats) -> Floats:
     return np.column_stack([ring, np.full(len(ring), sample[:, 2].mean())])
 
 
+def _is_here(folder: Path) -> bool:
+    """Return whether a folder that was just made is here too, on a network's file system as well."""
+    # a network's file system may hold for a while that there is none, until the folder above it is listed
+    return folder.is_dir() or (folder.parent.is_dir() and folder.name in os.listdir(folder.parent))
+
+
 def _row_path(folder: Path, name: str) -> Path:
     return folder / _ROWS / f"{name}.json"
 
@@ -238,14 +274,14 @@ def _write_row(folder: Path, row: Row) -> None:
 
 
 def _row_of(folder: Path, job: Job) -> Row | None:
-    """Return the row of a job; None where there is none that can be read."""
+    """Return the row of a job; None where there is none that can be read, or it is of another input."""
     from pydantic import TypeAdapter, ValidationError
 
     try:
         row = TypeAdapter(Row).validate_json(read_whole(_row_path(folder, job.name)))
     except (OSError, ValidationError, InputError):
         return None
-    return row if row.name == job.name and _is_placed(row) else None
+    return row if (row.name, row.key) == (job.name, job.key) and _is_placed(row) else None
 
 
 def _is_placed(row: Row) -> bool:
@@ -285,31 +321,57 @@ def write_table(path: Path, rows: Sequence[Row]) -> Path:
 def write_map(path: Path, rows: Sequence[Row]) -> Path:
     """Write the outlines of the sources where they were placed, with verdict and probability, as GeoPackage.
 
-    The map is in the CRS of the first target; what was placed in another is brought there.
+    The layer ``footprints`` is in the CRS of the first target that has one; what was placed in another is
+    brought there. Outlines in targets without a CRS have a layer of their own, ``footprints_local``.
+
+    Args:
+        path: the file; one that is there is replaced.
+        rows: of the batch; those that were not placed are left out.
+
+    Returns:
+        The file.
+
+    Raises:
+        OutputError: if it cannot be written.
+
     """
     from pyproj import CRS
 
-    from mtpcr_geo.export.geopackage import Layer, write_geopackage
+    from mtpcr_geo.export.geopackage import write_geopackage
 
-    placed = [row for row in rows if row.footprint]
-    crs = CRS.from_wkt(placed[0].crs) if placed and placed[0].crs else None
-    shown = [row for row in placed if bool(row.crs) == (crs is not None)]
-    fields = {
-        name: np.array([getattr(row, name) for row in shown], np.str_)
-        for name in ("name", "verdict", "source", "target", "reason", "folder")
-    } | {
-        name: np.array([np.nan if getattr(row, name) is None else getattr(row, name) for row in shown])
-        for name in ("probability", "margin", "null_ratio", "yaw_deg", "sigma_plan_m", "seconds")
-    }
-    outlines = [_in_crs(row, crs) for row in shown]
-    layer = Layer("footprints", "POLYGON", outlines, fields, "outlines of the sources where they were placed")
+    placed = [row for row in rows if row.footprint and row.crs]
+    local = [row for row in rows if row.footprint and not row.crs]
+    crs = CRS.from_wkt(placed[0].crs) if placed else None
+    layers = []
+    if placed or not local:
+        layers.append(_layer("footprints", placed, crs))
+    if local:
+        layers.append(_layer("footprints_local", local, None))
     part = path.with_name(f".{path.stem}.part-{os.getpid()}{path.suffix}")
     try:
-        write_geopackage(part, [layer], crs)
+        write_geopackage(part, layers, crs)
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
     return path
+
+
+def _layer(name: str, rows: Sequence[Row], crs: CRS | None) -> Layer:
+    """Return outlines with what the table says of them, in a CRS; or local, each in its target's frame."""
+    from mtpcr_geo.export.geopackage import Layer
+
+    fields = {
+        field: np.array([getattr(row, field) for row in rows], np.str_)
+        for field in ("name", "verdict", "source", "target", "reason", "folder")
+    } | {
+        field: np.array([np.nan if getattr(row, field) is None else getattr(row, field) for row in rows])
+        for field in ("probability", "margin", "null_ratio", "yaw_deg", "sigma_plan_m", "seconds")
+    }
+    outlines = [_in_crs(row, crs) for row in rows]
+    about = "outlines of the sources where they were placed"
+    if crs is None and rows:
+        about = f"{about}, in the coordinates of targets without a CRS"
+    return Layer(name, "POLYGON", outlines, fields, about, local=crs is None)
 
 
 def _in_crs(row: Row, crs: CRS | None) -> Floats:

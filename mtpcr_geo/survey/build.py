@@ -8,10 +8,12 @@ is killed goes on where it stopped, and gives the same bits.
 from __future__ import annotations
 
 import io
+import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 import numpy as np
@@ -27,12 +29,14 @@ from mtpcr_geo.io.formats import files_at, open_any
 from mtpcr_geo.io.no_returns import NoReturns, without
 from mtpcr_geo.method.bev import MAX_CELLS, choose_cell
 from mtpcr_geo.survey import is_survey
-from mtpcr_geo.survey.engine import engine_of
+from mtpcr_geo.survey.engine import SAME_PATHS, engine_of
 from mtpcr_geo.survey.index import (
     INDEX,
+    PLACE,
     Survey,
     Tile,
     date_of,
+    dimensions_of,
     read_frame,
     write_atomic,
     write_frame,
@@ -40,6 +44,9 @@ from mtpcr_geo.survey.index import (
 from mtpcr_geo.survey.mosaic import BLOCK_CELLS, BLOCKS, BlockRasteriser, Frame, Mosaic, Place, merge
 from mtpcr_geo.survey.options import BuildOptions
 from mtpcr_geo.survey.vrt import write_virtual
+
+if TYPE_CHECKING:
+    from pyproj import CRS
 
 MOST_BLOCKS = MAX_CELLS // BLOCK_CELLS**2
 DEFAULTS = BuildOptions()
@@ -56,6 +63,7 @@ class Built:
         read: tiles whose points were read.
         merged: blocks that were written.
         failed: tiles that could not be used, and why.
+        gone: tiles that stay in the survey, were not named now, and whose files are no longer there.
 
     """
 
@@ -63,6 +71,7 @@ class Built:
     read: int
     merged: int
     failed: dict[Path, str]
+    gone: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -109,11 +118,12 @@ def build_survey(
         InputError: if no tile can be used.
         CrsError: if the tiles have no projected CRS.
         OptionError: if an option does not go with an existing survey.
-        OutputError: if the folder holds something else, or cannot be written.
+        OutputError: if the folder holds something else, cannot be written, or is another one on the workers.
         MissingPartError: if more than one worker is wanted and Dask is not installed.
 
     """
-    folder = Path(folder)
+    # workers may run in other folders, and on other machines
+    folder = Path(folder).absolute()
     progress = progress or NoProgress()
     named = [Tile.at(path) for name in tiles for path in files_at(Path(name))]
     named = list({tile.path: tile for tile in named}.values())
@@ -122,8 +132,10 @@ def build_survey(
     _refuse_links(folder)
     frame = _frame(folder, named, options)
     kept = _earlier(folder, frame)
+    gone: list[Tile] = []
     if not options.prune:
-        named += [tile for path, tile in kept.items() if path not in {one.path for one in named}]
+        others, gone = _not_named(named, kept)
+        named += [*others, *gone]
     wanted = [tile for tile in named if not _is_read(kept.get(tile.path), tile, folder)]
     failed: dict[Path, str] = {}
     done = {tile.path: kept[tile.path] for tile in named if tile not in wanted}
@@ -139,6 +151,7 @@ def build_survey(
         if not done:
             path, why = next(iter(failed.items()))
             raise InputError(f"none of the {len(named)} tiles can be used; the first, {path}: {why}")
+        _refuse_elsewhere(folder, [_part_of(folder, tile) for tile in done.values()], _parts_in(folder))
         survey = Survey(folder, frame).with_tiles(done.values())
         blocks = survey.blocks()
         merging = [_Merging(survey.mosaic, place, tuple(some)) for place, some in blocks.items()]
@@ -148,13 +161,29 @@ def build_survey(
                 if merged.error is not None:
                     raise OutputError(f"block {merged.item.place} cannot be made: {merged.error}")
                 advance(1)
-    for place in survey.mosaic.places():
+    there = survey.mosaic.places()
+    mosaic_of = survey.mosaic.path_of
+    _refuse_elsewhere(folder, map(mosaic_of, blocks), map(mosaic_of, there))
+    for place in there:
         if place not in blocks:
             survey.mosaic.remove(place)
     write_virtual(survey.mosaic, list(blocks))
     survey.write_index()
     _remove_parts(survey)
-    return Built(survey, len(wanted) - len(failed), len(stale), failed)
+    missing = tuple(tile.path for tile in gone if tile.path in done)
+    return Built(survey, len(wanted) - len(failed), len(stale), failed, missing)
+
+
+def _not_named(named: Sequence[Tile], kept: Mapping[Path, Tile]) -> tuple[list[Tile], list[Tile]]:
+    """Return the tiles of a survey that are not named now, as they are: those there, and those gone."""
+    there: list[Tile] = []
+    gone: list[Tile] = []
+    for path in sorted(kept.keys() - {tile.path for tile in named}):
+        try:
+            there.append(Tile.at(path))
+        except InputError:
+            gone.append(kept[path])
+    return there, gone
 
 
 def _refuse_links(folder: Path) -> None:
@@ -168,6 +197,22 @@ def _refuse_links(folder: Path) -> None:
     if link is not None:
         raise OutputError(
             f"{short(link)} is a link, and a survey keeps its files in its own folder; remove it"
+        )
+
+
+def _refuse_elsewhere(folder: Path, wanted: Iterable[Path], found: Iterable[Path]) -> None:
+    """Refuse to go on where files that were written are not there, as workers see another folder.
+
+    Raises:
+        OutputError: naming the first.
+
+    """
+    there = set(found)
+    missing = [path for path in wanted if path not in there]
+    if missing:
+        raise OutputError(
+            f"{len(missing)} files of the survey, such as {short(missing[0].relative_to(folder))}, were "
+            f"written to another {short(folder)} than is here; {SAME_PATHS}"
         )
 
 
@@ -194,7 +239,9 @@ def _frame(folder: Path, tiles: Sequence[Tile], options: BuildOptions) -> Frame:
         raise CrsError(
             f"a survey needs tiles in a projected CRS, and these are in {facts.name}; reproject them first"
         )
-    wkt = facts.horizontal.to_wkt() if facts.vertical is None else crs.to_wkt()
+    # where nothing is said of heights, not even their unit, the CRS in plan is all there is
+    plain = facts.height == "unsaid" and not facts.height_unit_stated
+    wkt = facts.horizontal.to_wkt() if plain else crs.to_wkt()
     cell = options.cell
     if cell is None:
         boxes = [np.maximum(head.maximum[:2] - head.minimum[:2], 1.0) * facts.unit for head in heads]
@@ -230,9 +277,23 @@ def _heads(tiles: Sequence[Tile]) -> list[Cloud]:
 
 def _check_crs(claimed: str, frame: Frame, what: str) -> None:
     crs = parse_crs(claimed)
-    if crs is None or not same_place(crs, frame.crs):
-        name = "local coordinates" if crs is None else crs.name
-        raise CrsError(f"{what} is {name}, and the survey is in {frame.crs.name}; reproject it first")
+    if crs is None:
+        raise CrsError(
+            f"{what} is local coordinates, and the survey is in {frame.crs.name}; reproject it first"
+        )
+    if not same_place(crs, frame.crs):
+        name, own = _told_apart(crs, frame.crs)
+        raise CrsError(f"{what} is {name}, and the survey is in {own}; reproject it first")
+
+
+def _told_apart(one: CRS, other: CRS) -> tuple[str, str]:
+    """Return names of two CRSs that are not one; with heights and their units where they are one in plan."""
+    first, second = facts_of(one), facts_of(other)
+    plans = (first.horizontal, second.horizontal)
+    if plans[0] is None or plans[1] is None or not same_place(plans[0], plans[1]):
+        return str(one.name), str(other.name)
+    heights = (f" with {facts.height_name} in {facts.height_unit_name}" for facts in (first, second))
+    return f"{plans[0].name}{next(heights)}", f"{plans[1].name}{next(heights)}"
 
 
 def _earlier(folder: Path, frame: Frame) -> dict[Path, Tile]:
@@ -240,7 +301,7 @@ def _earlier(folder: Path, frame: Frame) -> dict[Path, Tile]:
     found: dict[Path, Tile] = {}
     if (folder / INDEX).is_file():
         found = {tile.path: tile for tile in Survey.open(folder).tiles}
-    for path in sorted((folder / _PARTS).glob("*.npz")):
+    for path in sorted(_parts_in(folder)):
         tile = _tile_in(path)
         if tile is not None:
             found[tile.path] = tile
@@ -249,6 +310,10 @@ def _earlier(folder: Path, frame: Frame) -> dict[Path, Tile]:
 
 def _is_read(known: Tile | None, tile: Tile, folder: Path) -> bool:
     return known is not None and known.state == tile.state and _part_of(folder, tile).is_file()
+
+
+def _parts_in(folder: Path) -> Iterator[Path]:
+    return (folder / _PARTS).glob("*.npz")
 
 
 def _part_of(folder: Path, tile: Tile) -> Path:
@@ -262,7 +327,8 @@ def _rasterise(job: _Reading) -> Tile:
         problem = getattr(cloud, "crs_problem", "") or "it states none"
         raise CrsError(f"it has no CRS ({problem}); give --crs")
     if not same_place(cloud.crs, job.frame.crs):
-        raise CrsError(f"it is in {cloud.crs.name}, and the survey in {job.frame.crs.name}")
+        name, own = _told_apart(cloud.crs, job.frame.crs)
+        raise CrsError(f"it is in {name}, and the survey in {own}; reproject it first")
     blocks = BlockRasteriser(job.frame, MOST_BLOCKS, cloud.name)
     low, high, used = np.full(3, np.inf), np.full(3, -np.inf), 0
     none = NoReturns(0)
@@ -279,7 +345,13 @@ def _rasterise(job: _Reading) -> Tile:
     made = blocks.finish()
     bounds = tuple(float(value) for value in (*low, *high)) if used else (0.0,) * 6
     tile = replace(
-        job.tile, points=cloud.count, used=used, bounds=bounds, blocks=tuple(made), date=date_of(cloud)
+        job.tile,
+        points=cloud.count,
+        used=used,
+        bounds=bounds,
+        blocks=tuple(made),
+        date=date_of(cloud),
+        dimensions=dimensions_of(cloud),
     )
     if not job.tile.unchanged():
         raise InputError(f"{tile.path} changed while it was read; run survey build again")
@@ -300,6 +372,7 @@ def _write_part(path: Path, tile: Tile, blocks: dict[Place, Bev]) -> None:
         "bounds": np.array(tile.bounds),
         "blocks": np.array(tile.blocks, np.int64).reshape(-1, 2),
         "date": np.array(tile.date or ""),
+        "dimensions": np.array(json.dumps(tile.dimensions)),
     }
     for (column, row), bev in blocks.items():
         filled = bev.count > 0
@@ -339,6 +412,8 @@ def _tile_in(path: Path) -> Tile | None:
             size, modified, points, used = (int(value) for value in held["numbers"])
             bounds = tuple(float(value) for value in held["bounds"])
             blocks = tuple((int(c), int(r)) for c, r in held["blocks"])
+            # builds of earlier versions did not keep them
+            kept = json.loads(str(held["dimensions"])) if "dimensions" in held else ()
             return Tile(
                 Path(str(held["path"])),
                 size,
@@ -348,8 +423,9 @@ def _tile_in(path: Path) -> Tile | None:
                 bounds,
                 blocks,
                 str(held["date"]) or None,
+                tuple((str(name), str(kind), int(size)) for name, kind, size in kept) or PLACE,
             )
-    except (OSError, ValueError, KeyError, BadZipFile):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, BadZipFile):
         return None
 
 

@@ -40,8 +40,8 @@ def cut_out(survey: Survey, box: Floats) -> CutOut:
         box: (2, 2) lowest and highest x and y, in units of its CRS.
 
     Raises:
-        InputError: if there are none, too many, or a tile cannot be read or has changed since the survey was
-            built.
+        InputError: if there are none, too many, or a tile cannot be read, is gone, or has changed since the
+            survey was built.
 
     """
     tiles = survey.tiles_in(box)
@@ -49,9 +49,14 @@ def cut_out(survey: Survey, box: Floats) -> CutOut:
     held = 0
     for tile in tiles:
         if not tile.unchanged():
+            if tile.path.exists():
+                raise InputError(
+                    f"the tile {tile.path} has changed since the survey {survey.folder} was built; run "
+                    "survey build again"
+                )
             raise InputError(
-                f"the tile {tile.path} is gone, or has changed since the survey {survey.folder} was built; "
-                "run survey build again"
+                f"the tile {tile.path} of the survey {survey.folder} is no longer there; put it back, or run "
+                "survey build --prune with all tiles that the survey shall have"
             )
         for xyz, noise in _chunks(tile.path, box):
             inside = (xyz[:, :2] >= box[0]).all(axis=1) & (xyz[:, :2] <= box[1]).all(axis=1)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from traceback import extract_tb
 from typing import Any, Generic, TypeVar
 
 from mtpcr_geo.core.errors import InputError, MissingPartError, MtpcrError
@@ -15,6 +17,7 @@ Item = TypeVar("Item")
 Made = TypeVar("Made")
 
 CONNECT_S = 30.0
+SAME_PATHS = "all workers must see the same folders, under the same paths, as this machine"
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class Engine:
     ) -> Iterator[Outcome[Item, Made]]:
         """Do each piece of work; yield what became of each, in the order in which they end.
 
-        An error that a user can cause ends its piece alone.
+        An error ends its piece alone, be it one that a user can cause or a defect.
 
         Args:
             work: a function of a module.
@@ -92,6 +95,15 @@ def _tried(work: Callable[[Any], Any], item: Any, most: int = 0) -> tuple[Any, s
             return work(item), None
     except MtpcrError as error:
         return None, f"{type(error).__name__}: {error}"
+    except Exception as error:  # noqa: BLE001 - the other pieces are done whatever fails in this one
+        return None, _defect(error)
+
+
+def _defect(error: BaseException) -> str:
+    """Say in a line what went wrong in the program, and in which line of it."""
+    frames = extract_tb(error.__traceback__)
+    where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    return f"a defect: {type(error).__name__}: {error}{where}"
 
 
 def _why(failure: BaseException) -> str:
@@ -99,7 +111,7 @@ def _why(failure: BaseException) -> str:
 
     if isinstance(failure, KilledWorker):
         return "its worker process died each time it was tried; is there memory enough?"
-    return f"a defect: {type(failure).__name__}: {failure}"
+    return _defect(failure)
 
 
 def has_dask() -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -15,6 +15,7 @@ import numpy as np
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import InputError, OutputError
 from mtpcr_geo.core.paths import read_whole, real, short
+from mtpcr_geo.io.las import LasCloud
 from mtpcr_geo.survey import SURVEY
 from mtpcr_geo.survey.mosaic import FACTORS, Frame, Mosaic, Place
 
@@ -25,6 +26,11 @@ INDEX = "index.vpc"
 _FORMAT, _VERSION = "mtpcr-geo survey", 1
 _LONGEST_M = 1e6
 _OWN = "mtpcr:"
+
+Dimension = tuple[str, str, int]
+"""Name, type (floating, signed or unsigned) and bytes of a dimension of points, as PDAL has them."""
+PLACE: tuple[Dimension, ...] = tuple((axis, "floating", 8) for axis in "XYZ")
+_TYPES = {"f": "floating", "i": "signed", "u": "unsigned", "b": "unsigned"}
 
 
 @dataclass(frozen=True)
@@ -41,6 +47,7 @@ class Tile:
             where there are none.
         blocks: the blocks that it reaches.
         date: day on which the file was made, by its header, as YYYY-MM-DD; None where it says none.
+        dimensions: of its points; those of the place alone where the format or an earlier build did not tell.
 
     """
 
@@ -52,6 +59,7 @@ class Tile:
     bounds: tuple[float, ...] = (0.0,) * 6
     blocks: tuple[Place, ...] = ()
     date: str | None = None
+    dimensions: tuple[Dimension, ...] = PLACE
 
     @classmethod
     def at(cls, path: Path) -> Tile:
@@ -248,6 +256,19 @@ def date_of(cloud: Cloud) -> str | None:
     return None if found is None else found.isoformat()
 
 
+def dimensions_of(cloud: Cloud) -> tuple[Dimension, ...]:
+    """Return the dimensions of the points of a LAS file; those of the place alone for other formats."""
+    if not isinstance(cloud, LasCloud):
+        return PLACE  # some are read whole before their first point is known
+    table = next(iter(cloud.table_chunks(1)), None)
+    found: list[Dimension] = []
+    for name, values in (table or {}).items():
+        # PDAL numbers the members of an array
+        each = range(values.shape[1]) if values.ndim > 1 else ("",)
+        found += [(f"{name}{one}", _TYPES[values.dtype.kind], values.dtype.itemsize) for one in each]
+    return tuple(found) or PLACE
+
+
 def _feature_of(tile: Tile, survey: Survey) -> dict[str, Any]:
     from pyproj import Transformer
 
@@ -257,7 +278,9 @@ def _feature_of(tile: Tile, survey: Survey) -> dict[str, Any]:
     corners = [[round(value, 9) for value in to_degrees.transform(x, y)] for x, y in ring]
     box = [min(c[0] for c in corners), min(c[1] for c in corners), max(c[0] for c in corners),
            max(c[1] for c in corners)]  # fmt: skip
-    href = Path(os.path.relpath(tile.path, real(survey.folder))).as_posix()
+    # QGIS and pdal_wrench take a path for relative where it begins so, and in no other case
+    href = f"./{Path(os.path.relpath(tile.path, real(survey.folder))).as_posix()}"
+    schemas = [{"name": name, "type": kind, "size": size} for name, kind, size in tile.dimensions]
     return {
         "type": "Feature",
         "stac_version": "1.0.0",
@@ -269,11 +292,15 @@ def _feature_of(tile: Tile, survey: Survey) -> dict[str, Any]:
         "geometry": {"type": "Polygon", "coordinates": [corners]},
         "bbox": box,
         "properties": {
+            # where the header says none nothing true is known: STAC would have a range of time for it, and
+            # the file's last change is no more than one end of that
             "datetime": None if tile.date is None else f"{tile.date}T00:00:00Z",
             "pc:count": tile.points,
             "pc:type": "lidar",
             "pc:encoding": tile.path.suffix.lstrip(".").lower(),
+            "pc:schemas": schemas,
             "proj:wkt2": survey.frame.wkt,
+            "proj:geometry": {"type": "Polygon", "coordinates": [ring]},
             "proj:bbox": list(tile.bounds),
             f"{_OWN}size": tile.size,
             f"{_OWN}modified_ns": tile.modified_ns,
@@ -283,6 +310,12 @@ def _feature_of(tile: Tile, survey: Survey) -> dict[str, Any]:
         "links": [],
         "assets": {"data": {"href": href, "roles": ["data"]}},
     }
+
+
+def _dimensions_in(schemas: Iterable[Mapping[str, Any]]) -> tuple[Dimension, ...]:
+    """Return dimensions as an index says them; those of the place, where it says none."""
+    found = tuple((str(one["name"]), str(one["type"]), int(one["size"])) for one in schemas)
+    return found or PLACE
 
 
 def _tile_of(feature: dict[str, Any], folder: Path) -> Tile:
@@ -297,4 +330,5 @@ def _tile_of(feature: dict[str, Any], folder: Path) -> Tile:
         tuple(float(value) for value in about["proj:bbox"]),
         tuple((int(c), int(r)) for c, r in about[f"{_OWN}blocks"]),
         None if date is None else str(date)[:10],
+        _dimensions_in(about.get("pc:schemas", ())),
     )

@@ -7,8 +7,9 @@ import io
 import json
 import os
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,8 @@ from typing import Any
 from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError
 from mtpcr_geo.core.paths import read_whole, real
 from mtpcr_geo.io.formats import files_at
-from mtpcr_geo.io.many import output_names
-from mtpcr_geo.pipeline.options import RegisterOptions
+from mtpcr_geo.io.many import placed
+from mtpcr_geo.pipeline.options import PRIOR_WORDS, RegisterOptions
 from mtpcr_geo.registration import read_options
 from mtpcr_geo.survey import is_survey
 from mtpcr_geo.survey.index import INDEX
@@ -25,6 +26,7 @@ from mtpcr_geo.survey.index import INDEX
 OWN_COLUMNS = ("name", "source", "target")
 _OF_THE_BATCH = ("overwrite",)
 _PAIRS = ("near",)
+_PATHS = ("prior", "models")
 
 
 @dataclass(frozen=True)
@@ -46,21 +48,38 @@ class Job:
     @property
     def key(self) -> str:
         """What changes when the job would give another result: its files, its options."""
-        about = {
+        about: dict[str, Any] = {
             "source": _states(self.source),
             "target": _states(self.target / INDEX if is_survey(self.target) else self.target),
             "options": dict(self.options),
         }
+        for name, path in _paths_in(self.options).items():
+            about[name] = [_state(one) for one in _at(path)]
         return sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()
+
+    def placed(self, folder: str | os.PathLike[str] = "") -> Job:
+        """Return the job with all paths absolute, so that any process on any machine reads the same by them.
+
+        Args:
+            folder: what the paths are relative to; the present one if not given.
+
+        """
+        paths = {name: str(placed(path, folder)) for name, path in _paths_in(self.options).items()}
+        source, target = placed(self.source, folder), placed(self.target, folder)
+        return replace(self, source=source, target=target, options={**self.options, **paths})
 
 
 def jobs_of(path: Path, target: Path | None, common: Mapping[str, Any]) -> list[Job]:
     """Read the jobs of a batch.
 
     Args:
-        path: a table (CSV) with a row a job, or a folder, pattern or list of sources.
+        path: a table (CSV) with a row a job, whose paths are relative to it; or a folder, pattern or list of
+            sources.
         target: of the jobs that name none.
         common: options of all jobs; columns of the table take precedence.
+
+    Returns:
+        The jobs, with absolute paths, links not followed.
 
     Raises:
         InputError: if the table cannot be read, or names no job.
@@ -69,12 +88,11 @@ def jobs_of(path: Path, target: Path | None, common: Mapping[str, Any]) -> list[
     """
     if path.suffix.lower() == ".csv" and os.path.isfile(path):
         return _of_table(path, target, common)
-    sources = files_at(path)
+    sources = files_at(placed(path))
     if target is None:
         raise OptionError("name the target of the sources: --target FILE, or the folder of a survey")
-    names = [_name(Path(name).stem) for name in output_names(sources)]
     options = _given(common)
-    return [Job(name, source, target, options) for name, source in zip(names, sources, strict=True)]
+    return [Job(name, source, target, options).placed() for name, source in _named(sources)]
 
 
 def _of_table(path: Path, target: Path | None, common: Mapping[str, Any]) -> list[Job]:
@@ -101,17 +119,19 @@ def _of_table(path: Path, target: Path | None, common: Mapping[str, Any]) -> lis
         named = values.get("target") or ""
         if not named and target is None:
             raise OptionError(f"{where} names no target; add a column target, or give --target")
-        source = path.parent / values["source"]
         options = {key: _value(key, text) for key, text in values.items() if text and key not in OWN_COLUMNS}
         try:
             given = _given({**common, **options})
         except MtpcrError as error:
             raise OptionError(f"{where}: {error}") from None
-        name = _name(values.get("name") or source.stem)
+        # what the table says is relative to it, what the command line says to where it is given
+        here = {key: str(placed(one)) for key, one in _paths_in(given).items() if key not in options}
+        name = _name(values.get("name") or Path(values["source"]).stem)
         if name.lower() in taken:
             raise InputError(f"{where}: there is a job {name} already; add a column name")
         taken.add(name.lower())
-        jobs.append(Job(name, source, path.parent / named if named else Path(target or ""), given))
+        goal = Path(named) if named else placed(target or "")
+        jobs.append(Job(name, Path(values["source"]), goal, {**given, **here}).placed(path.parent))
     return jobs
 
 
@@ -134,13 +154,55 @@ def _value(name: str, text: str) -> Any:
     return text
 
 
+def _named(sources: Sequence[Path]) -> list[tuple[str, Path]]:
+    """Return each source with a name that no other has, upper and lower case taken as one.
+
+    Of names that would be the same each gets a suffix that follows from the path alone: it stays when sources
+    come and go beside it.
+    """
+    each = list({os.path.abspath(source): source for source in sources}.items())
+    names = [_name(source.stem) for _, source in each]
+    often = Counter(name.casefold() for name in names)
+    return [
+        (
+            name if often[name.casefold()] == 1 else f"{name}-{sha256(os.fsencode(path)).hexdigest()[:8]}",
+            source,
+        )
+        for name, (path, source) in zip(names, each, strict=True)
+    ]
+
+
 def _name(text: str) -> str:
     """Return a name that a folder may have."""
     return re.sub(r"[^\w.+-]+", "_", text).strip(".") or "job"
 
 
+def _paths_in(options: Mapping[str, Any]) -> dict[str, Path]:
+    """Return the options that are a file or a folder."""
+    found = {name: options[name] for name in _PATHS if isinstance(options.get(name), str | os.PathLike)}
+    return {name: Path(value) for name, value in found.items() if name != "prior" or value not in PRIOR_WORDS}
+
+
+def _at(path: Path) -> list[Path]:
+    """Return the files of a folder; what is none is itself."""
+    try:
+        return sorted(path.iterdir()) if path.is_dir() else [path]
+    except OSError:
+        return [path]
+
+
 def _states(path: Path) -> list[tuple[str, int, int]]:
     try:
-        return [(str(real(one)), one.stat().st_size, one.stat().st_mtime_ns) for one in files_at(path)]
-    except (OSError, InputError):
-        return [(str(path), -1, -1)]
+        files = files_at(path)
+    except InputError:
+        files = [path]
+    return [_state(one) for one in files]
+
+
+def _state(path: Path) -> tuple[str, int, int]:
+    """Return what changes when a file does."""
+    try:
+        found = path.stat()
+    except (OSError, ValueError):
+        return str(path), -1, -1
+    return str(real(path)), found.st_size, found.st_mtime_ns

@@ -23,6 +23,7 @@ from mtpcr_geo.core.errors import InputError, OutputError
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev
 from mtpcr_geo.core.version import __version__
+from mtpcr_geo.crs.facts import facts_of
 from mtpcr_geo.method.bev import Rasteriser
 
 if TYPE_CHECKING:
@@ -63,6 +64,15 @@ class Frame:
         from pyproj import CRS
 
         return CRS.from_wkt(self.wkt)
+
+    @cached_property
+    def raster_wkt(self) -> str:
+        """WKT of the CRS of the rasters: with a vertical datum where they are in its unit, metres."""
+        facts = facts_of(self.crs)
+        # a GeoTIFF with a CRS of three axes is read back without any
+        if facts.horizontal is None or (facts.vertical is not None and self.height_unit_m == 1.0):
+            return self.wkt
+        return str(facts.horizontal.to_wkt())
 
     @property
     def block_m(self) -> float:
@@ -324,5 +334,5 @@ class Mosaic:
             "height": grid.height,
             "nodata": float("nan"),
             "transform": Affine(step, 0.0, grid.west / unit, 0.0, -step, grid.north / unit),
-            "crs": self.frame.wkt,
+            "crs": self.frame.raster_wkt,
         }

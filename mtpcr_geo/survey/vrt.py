@@ -25,6 +25,20 @@ def write_virtual(mosaic: Mosaic, places: Sequence[Place]) -> None:
             write_atomic(mosaic.folder / name, _virtual(mosaic, places, number, factor))
 
 
+def _axes_of(wkt: str) -> list[int]:
+    """Return the axes of a CRS, counted from 1, in the order of the data: east, north, up."""
+    from pyproj import CRS
+
+    axes = CRS.from_wkt(wkt).axis_info
+    numbers = list(range(1, len(axes) + 1))
+    first, second = axes[:2]
+    # on a pole both point the same way, and their names say which is which
+    at_pole = first.direction == second.direction and first.name.lower().startswith("northing")
+    if (first.direction, second.direction) == ("north", "east") or at_pole:
+        numbers[:2] = [2, 1]
+    return numbers
+
+
 def _virtual(mosaic: Mosaic, places: Sequence[Place], number: int, factor: int) -> bytes:
     frame = mosaic.frame
     side = BLOCK_CELLS // factor
@@ -35,7 +49,8 @@ def _virtual(mosaic: Mosaic, places: Sequence[Place], number: int, factor: int) 
     root = ElementTree.Element(
         "VRTDataset", rasterXSize=str((east - west) * side), rasterYSize=str((north - south) * side)
     )
-    ElementTree.SubElement(root, "SRS", dataAxisToSRSAxisMapping="1,2").text = frame.wkt
+    mapping = ",".join(map(str, _axes_of(frame.raster_wkt)))
+    ElementTree.SubElement(root, "SRS", dataAxisToSRSAxisMapping=mapping).text = frame.raster_wkt
     placed = (west * edge, step, 0.0, north * edge, 0.0, -step)
     ElementTree.SubElement(root, "GeoTransform").text = ", ".join(f"{value:.17g}" for value in placed)
     about = ElementTree.SubElement(root, "Metadata")

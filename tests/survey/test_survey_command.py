@@ -65,6 +65,21 @@ def test_a_tile_that_failed_is_said(tmp_path: Path) -> None:
     assert "1 tiles could not be used" in result.stderr
 
 
+def test_a_tile_that_is_gone_is_said(tmp_path: Path) -> None:
+    tiles = tiles_of(tmp_path / "tiles", town_target(points=5000))
+    arguments = ("survey", "build", tmp_path / "tiles", "-o", tmp_path / "survey", "--workers", 1)
+    assert run(*arguments).exit_code == 0
+    tiles[1].unlink()
+    again = run(*arguments)
+    assert again.exit_code == 0
+    assert "1 tiles of the survey are no longer there" in again.stderr
+    assert "tile1.laz" in again.stderr
+    assert "--prune" in again.stderr
+    pruned = run(*arguments, "--prune")
+    assert (pruned.exit_code, pruned.stderr) == (0, "")
+    assert "3 tiles" in pruned.stdout
+
+
 def test_dask_is_imported_only_where_it_is_used() -> None:
     code = (
         "import sys; import mtpcr_geo.cli.survey, mtpcr_geo.cli.batch, mtpcr_geo.survey.batch; "
