@@ -13,10 +13,12 @@ from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.groups import Groups
 from mtpcr_geo.core.types import Bev
-from mtpcr_geo.method.bev import BLOCK, grid_around, rasterise
+from mtpcr_geo.method.bev import BLOCK, MAX_CELLS, fitting_cell, grid_around, rasterise
 from mtpcr_geo.method.ground import connected_ground
 
 OVERLAP_CELL_M = 2.0
+MOST_OVERLAP_CELLS = MAX_CELLS // 4
+"""Cells of the grid of an overlap at most: some images of as many are held for each cloud."""
 LOW_RADIUS_M = 6.0
 LOW_ABOVE_M = 0.7
 SLOPE_RADIUS_M = 8.0
@@ -175,13 +177,16 @@ def overlap_of(
 
     Args:
         source, target: (n, 3) and (m, 3) metres in one frame.
-        cell: edge of a cell, metres.
+        cell: edge of a cell, metres; doubled until the grid has `MOST_OVERLAP_CELLS` at most, which cells of
+            2 m are for a square of 8 km. What came of it is the grid's.
         margin_cells: cells by which a filled cell counts around itself.
 
     """
     (low_s, high_s), (low_t, high_t) = transforms.bounds(source), transforms.bounds(target)
     low, high = np.maximum(low_s, low_t) - 2 * cell, np.minimum(high_s, high_t) + 2 * cell
-    grid = grid_around(low, np.maximum(high, low + cell), cell)
+    high = np.maximum(high, low + cell)
+    cell = fitting_cell(low, high, cell, MOST_OVERLAP_CELLS)
+    grid = grid_around(low, high, cell)
     source, target = (_nearby(grid, xyz) for xyz in (source, target))
     s, t = rasterise([source], grid), rasterise([target], grid)
     window = np.ones((2 * margin_cells + 1, 2 * margin_cells + 1), np.uint8)

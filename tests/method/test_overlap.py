@@ -8,7 +8,13 @@ from helpers_plots import plot, terrain
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.method.bev import grid_around, rasterise
-from mtpcr_geo.method.overlap import CommonGround, _ground, overlap_of
+from mtpcr_geo.method.overlap import (
+    MOST_OVERLAP_CELLS,
+    OVERLAP_CELL_M,
+    CommonGround,
+    _ground,
+    overlap_of,
+)
 from mtpcr_geo.method.settle import settle_on_ground
 
 
@@ -113,3 +119,18 @@ def test_noise_of_the_ground_explains_the_spread_under_the_right_place_alone() -
 def test_too_little_ground_has_no_shape() -> None:
     few = hillside(3, 0.0, 200, 8.0)
     assert not np.isfinite(overlap_of(few, few).common_ground().shape().spread_m)
+
+
+def test_an_overlap_of_many_kilometres_takes_larger_cells() -> None:
+    rng = np.random.default_rng(11)
+    wide = 20_000.0
+    xy = rng.uniform(0.0, wide, (3000, 2))
+    xyz = np.column_stack([xy, 30.0 * np.sin(xy[:, 0] / 900.0)])
+    overlap = overlap_of(xyz, xyz + [0.0, 0.0, 0.3])
+    assert overlap.grid.cell > OVERLAP_CELL_M
+    assert overlap.grid.width * overlap.grid.height <= MOST_OVERLAP_CELLS
+    assert overlap.select(xyz).mean() > 0.99
+    assert np.median(overlap.ground_steps()[1]) == pytest.approx(0.3, abs=1e-5)
+    # clouds of that size that share a corner only keep their cells
+    corner = overlap_of(xyz, xyz + [wide - 500.0, wide - 500.0, 0.0])
+    assert corner.grid.cell == OVERLAP_CELL_M
