@@ -70,7 +70,7 @@ def _at(xyz: Floats, places: Floats) -> Mask:
 
 def _repeated(xyz: Floats) -> list[Floats]:
     """Return the triples that far more of the points have than any usual one."""
-    if len(xyz) < 2 * FEWEST:
+    if len(xyz) < 2 * FEWEST or not _most_alike(xyz[:, 0]) >= FEWEST:
         return []
     order = np.lexsort(xyz.T[::-1])
     ordered = xyz[order]
@@ -81,3 +81,10 @@ def _repeated(xyz: Floats) -> list[Floats]:
     usual = float(np.percentile(times, 98.0))
     many = times >= max(FEWEST, TIMES_USUAL * usual)
     return list(ordered[starts[many]])
+
+
+def _most_alike(values: Floats) -> int:
+    """Return how many of (n,) values are the same at most, n > 0: far faster than sorting triples."""
+    ordered = np.sort(values)
+    starts = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1], [True]]))
+    return int(np.diff(starts).max())

@@ -90,9 +90,9 @@ def scan(cloud: Cloud, *, budget: int = BUDGET, seed: int = 0, progress: Progres
         task = progress.task(f"reading {cloud.name}", cloud.count)
     with task as advance:
         for xyz, noise in cloud.noise_chunks():
-            _check_finite(cloud, xyz, count)
-            count += len(xyz)
             box_of_all = bounds(xyz) if len(xyz) else None
+            _check_finite(cloud, xyz, box_of_all, count)
+            count += len(xyz)
             if box_of_all is not None:
                 whole = np.stack([np.minimum(whole[0], box_of_all[0]), np.maximum(whole[1], box_of_all[1])])
             good = xyz[~noise] if noise.any() else xyz
@@ -278,9 +278,9 @@ class _Subset:
         return self.points
 
 
-def _check_finite(cloud: Cloud, xyz: Floats, before: int) -> None:
-    # a NaN makes both comparisons false
-    if not len(xyz) or (xyz.min() >= -_LARGEST_COORDINATE and xyz.max() <= _LARGEST_COORDINATE):
+def _check_finite(cloud: Cloud, xyz: Floats, box: tuple[Floats, Floats] | None, before: int) -> None:
+    # a NaN among the points is one in their bounds, and makes both comparisons false
+    if box is None or (box[0].min() >= -_LARGEST_COORDINATE and box[1].max() <= _LARGEST_COORDINATE):
         return
     bad = ~np.isfinite(xyz).all(axis=1)
     what = "that are not finite"

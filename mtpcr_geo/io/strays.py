@@ -64,7 +64,12 @@ def stray_box(xyz: Floats) -> Floats | None:
 
 def beyond(xyz: Floats, box: Floats) -> Mask:
     """Return which of (n, 3) points lie outside a box (2, 3)."""
-    return np.asarray(((xyz < box[0]) | (xyz > box[1])).any(axis=1))
+    outside = np.zeros(len(xyz), bool)
+    # column by column it takes half the time
+    for column, low, high in zip(xyz.T, *box, strict=True):
+        outside |= column < low
+        outside |= column > high
+    return outside
 
 
 def within(xyz: Floats, box: Floats | None) -> Floats:

@@ -114,9 +114,10 @@ class Judge:
         corrected = _corrected(pose, patches, supporting, self.pyramid.at(factor), self._agree_m, fine[0])
         rescored = score_nearby(*fine, corrected, 1)[0]
         # patches that do not agree must not carry a good hypothesis away
+        ground = first.ground
         if rescored.score >= pose.score:
-            pose = rescored
-        return Candidate(pose, *self._patches(1, pose, self.radius_cells), self._compare_ground(pose))
+            pose, ground = rescored, self._compare_ground(rescored)
+        return Candidate(pose, *self._patches(1, pose, self.radius_cells), ground)
 
     def tie_points(self, best: Candidate) -> PatchMatches:
         """Return the patches of a hypothesis, smaller ones where the overlap holds few of the usual size.

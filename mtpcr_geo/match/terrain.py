@@ -8,10 +8,12 @@ plane where a vertical is not trusted, to judge any pose; `terrain_search` finds
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from mtpcr_geo.core.arrays import Floats, Image
 from mtpcr_geo.core.grid import Grid
@@ -49,6 +51,14 @@ class Terrain:
     low: Image
     mask: Image
 
+    @cached_property
+    def compared(self) -> tuple[Floats, NDArray[np.float32]]:
+        """Places of the cells that are compared with another ground, (n, 2) metres, and heights, (n,)."""
+        row, column = np.nonzero(self.mask)
+        every = _every(len(row))
+        row, column = row[::every], column[::every]
+        return self.grid.to_metres(np.column_stack([column, row]).astype(np.float64)), self.low[row, column]
+
     @classmethod
     def of(cls, bev: Bev, cell_m: float) -> Terrain:
         """Make it of a height raster of the bare ground, in cells of about ``cell_m`` metres."""
@@ -76,29 +86,39 @@ class Terrain:
 
 
 @dataclass(frozen=True)
-class GroundComparison:
-    """How the shapes of both grounds compare under a pose.
+class GroundSpread:
+    """How far the shapes of both grounds differ under a pose.
 
     Attributes:
         cells: cells compared, of `MOST_CELLS` of the source at most.
         spread_m: robust standard deviation of their height differences, after one shift or one plane.
         fewest: cells that are ground enough to compare.
-        relief_m: what that would be if neither ground told anything of the other: their own spreads in the
-            cells compared, added in squares.
-        beyond_plane_m: the same of what is left of each ground beside its own plane.
 
     """
 
     cells: int
     spread_m: float
     fewest: int = FEWEST_CELLS
-    relief_m: float = 0.0
-    beyond_plane_m: float = 0.0
 
     @property
     def known(self) -> bool:
         """Whether there was enough ground to compare."""
         return self.cells >= self.fewest
+
+
+@dataclass(frozen=True)
+class GroundComparison(GroundSpread):
+    """How the shapes of both grounds compare under a pose: how far they differ, and how far they could.
+
+    Attributes:
+        relief_m: what the spread would be if neither ground told anything of the other: their own spreads in
+            the cells compared, added in squares.
+        beyond_plane_m: the same of what is left of each ground beside its own plane.
+
+    """
+
+    relief_m: float = 0.0
+    beyond_plane_m: float = 0.0
 
 
 def cell_to_compare(source: Bev, target: Bev, coarsest_m: float) -> float:
@@ -153,42 +173,67 @@ def compare_ground(
             their median alone.
 
     """
-    every = _every(source)
-    fewest = max(FEWEST_CELLS, -(-fewest // every))
     places, heights = _common_heights(source, target, hypothesis)
-    cells = len(places)
-    if cells < FEWEST_CELLS:
-        return GroundComparison(cells, np.inf, fewest)
-    step = heights[1] - heights[0]
-    some = slice(None, None, -(-cells // CELLS_OF_PLANE))
+    found = _spread_of(source, places, heights, plane=plane, fewest=fewest)
+    if found.cells < FEWEST_CELLS:
+        return GroundComparison(found.cells, found.spread_m, found.fewest)
+    some = slice(None, None, -(-found.cells // CELLS_OF_PLANE))
     own, other = (_spread(_without_plane(places[some], one[some])) for one in heights)
-    beyond_plane = float(np.hypot(own, other))
-    if plane and cells >= 3 * FEWEST_CELLS:
-        return GroundComparison(
-            cells, _spread(_without_plane(places, step)), fewest, beyond_plane, beyond_plane
-        )
-    own, other = (_spread(one) for one in heights)
-    return GroundComparison(cells, _spread(step), fewest, float(np.hypot(own, other)), beyond_plane)
+    beyond_plane = relief = float(np.hypot(own, other))
+    if not _takes_plane(found.cells, plane):
+        own, other = (_spread(one) for one in heights)
+        relief = float(np.hypot(own, other))
+    return GroundComparison(found.cells, found.spread_m, found.fewest, relief, beyond_plane)
 
 
-def _every(source: Terrain) -> int:
-    """Return which cells of a source are compared: every so many-th."""
-    return max(1, -(-int(np.count_nonzero(source.mask)) // MOST_CELLS))
+def ground_spread(
+    source: Terrain, target: Terrain, hypothesis: Hypothesis, *, plane: bool = False
+) -> GroundSpread:
+    """Return how far both grounds differ under a pose, and nothing else of `compare_ground`.
+
+    Args:
+        source, target: both terrains.
+        hypothesis: the pose.
+        plane: see `compare_ground`.
+
+    """
+    return _spread_of(source, *_common_heights(source, target, hypothesis), plane=plane)
+
+
+def _spread_of(
+    source: Terrain, places: Floats, heights: list[Floats], *, plane: bool, fewest: int = FEWEST_CELLS
+) -> GroundSpread:
+    """Return how far (n,) heights of both grounds differ at (n, 2) places."""
+    cells = len(places)
+    fewest = max(FEWEST_CELLS, -(-fewest // _every(int(np.count_nonzero(source.mask)))))
+    if cells < FEWEST_CELLS:
+        return GroundSpread(cells, np.inf, fewest)
+    step = heights[1] - heights[0]
+    return GroundSpread(
+        cells, _spread(_without_plane(places, step) if _takes_plane(cells, plane) else step), fewest
+    )
+
+
+def _takes_plane(cells: int, plane: bool) -> bool:
+    """Return whether a plane that is free is taken from so many cells: of a few it would leave nothing."""
+    return plane and cells >= 3 * FEWEST_CELLS
+
+
+def _every(cells: int) -> int:
+    """Return which of the cells of a source are compared: every so many-th."""
+    return max(1, -(-cells // MOST_CELLS))
 
 
 def _common_heights(source: Terrain, target: Terrain, hypothesis: Hypothesis) -> tuple[Floats, list[Floats]]:
     """Return where both grounds are seen under a pose, (n, 2), and their heights there, (n,) each."""
-    row, column = np.nonzero(source.mask)
-    every = _every(source)
-    row, column = row[::every], column[::every]
-    xy = source.grid.to_metres(np.column_stack([column, row]).astype(np.float64))
+    xy, own = source.compared
     c, s = np.cos(hypothesis.yaw), np.sin(hypothesis.yaw)
     placed = xy @ np.array([[c, s], [-s, c]]) + hypothesis.shift
     px = target.grid.to_pixel(placed).astype(np.float32)
     x, y = px[:, :1], px[:, 1:]
     known = cv2.remap(target.mask, x, y, cv2.INTER_LINEAR)[:, 0] > KNOWN
     height = cv2.remap(target.low, x, y, cv2.INTER_LINEAR)[:, 0]
-    return placed[known], [one[known].astype(np.float64) for one in (source.low[row, column], height)]
+    return placed[known], [one[known].astype(np.float64) for one in (own, height)]
 
 
 def ground_closeness(
@@ -209,7 +254,7 @@ def ground_closeness(
     places, heights = _common_heights(source, target, hypothesis)
     if len(places) < FEWEST_CELLS:
         return -np.inf
-    if plane and len(places) >= 3 * FEWEST_CELLS:
+    if _takes_plane(len(places), plane):
         heights = [_without_plane(places, one) for one in heights]
     own, other = heights
     relief = float(np.hypot(_spread(own), _spread(other))) + NOISE_M / 2

@@ -14,7 +14,15 @@ from mtpcr_geo.core.types import Bev, Hypothesis
 from mtpcr_geo.match.pose import Pose, centre_of, warp_to
 from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.search import distinct, spectrum
-from mtpcr_geo.match.terrain import FEWEST_CELLS, KNOWN, NOISE_M, Terrain, compare_ground, ground_closeness
+from mtpcr_geo.match.terrain import (
+    FEWEST_CELLS,
+    KNOWN,
+    NOISE_M,
+    GroundSpread,
+    Terrain,
+    ground_closeness,
+    ground_spread,
+)
 
 PEAKS_A_YAW = 8
 """Shifts under one yaw that are proposed by each of both measures at most, where they are ranked by the
@@ -200,64 +208,80 @@ class TerrainSearch:
         return [pose for value, pose in found if value > 0.0]
 
 
-def settle(source: Terrain, target: Terrain, pose: Pose, *, plane: bool = False) -> Pose:
-    """Move a pose to where both grounds agree best near by (Gauss and Newton, outliers weighed down).
+class Settling:
+    """Moves poses to where both grounds agree best near by (Gauss and Newton, outliers weighed down).
 
     Args:
         source, target: both terrains.
-        pose: about the centre of the source's raster.
         plane: whether a plane of height differences is free too, for clouds whose vertical is not trusted;
             else their mean alone.
 
     """
-    grid = target.grid
-    rows, columns = np.nonzero(source.mask)
-    if len(rows) < FEWEST_CELLS:
-        return pose
-    offset = source.grid.to_metres(np.column_stack([columns, rows]).astype(np.float64)) - centre_of(
-        source.grid
-    )
-    height = source.low[rows, columns].astype(np.float64)
-    inner = cv2.erode(target.mask, np.ones((3, 3), np.uint8))
-    north, east = np.gradient(target.low, grid.cell)
-    yaw, x, y = pose.yaw, pose.east, pose.north
-    for _ in range(SETTLING_STEPS):
-        c, s = np.cos(yaw), np.sin(yaw)
-        turned = offset @ np.array([[c, s], [-s, c]])
-        px = grid.to_pixel(turned + [x, y]).astype(np.float32)
-        at = px[:, :1], px[:, 1:]
-        known = cv2.remap(inner, *at, cv2.INTER_LINEAR)[:, 0] > KNOWN
-        if known.sum() < 3 * FEWEST_CELLS:
-            return pose
-        low, to_east, to_north = (
-            cv2.remap(image.astype(np.float32), *at, cv2.INTER_LINEAR)[known, 0].astype(np.float64)
-            for image in (target.low, east, -north)
-        )
-        here = turned[known]
-        level = [np.ones(len(here)), *here.T] if plane else [np.ones(len(here))]
-        J = np.column_stack([to_east, to_north, to_north * here[:, 0] - to_east * here[:, 1], *level])
-        rest = height[known] - low
-        rest -= np.median(rest)
-        scale = max(1.4826 * float(np.median(np.abs(rest))), NOISE_M / 2)
-        weight = 1.0 / (1.0 + (rest / (2.0 * scale)) ** 2)
-        # flat ground tells nothing: a step of a cell, or of what turns the rim by one, costs as much as noise
-        rim = float(np.hypot(*here.T).max())
-        held = np.zeros(J.shape[1])
-        held[:3] = np.array([1.0, 1.0, rim]) * NOISE_M / grid.cell
-        step = np.linalg.solve(
-            (J * weight[:, None] ** 2).T @ J + np.diag(held**2 + 1e-12), (J * weight[:, None] ** 2).T @ rest
-        )
-        longest = max(float(np.hypot(step[0], step[1])), abs(step[2]) * rim)
-        step *= min(1.0, 2.0 * grid.cell / max(longest, 1e-12))
-        x, y, yaw = x + step[0], y + step[1], yaw + step[2]
-        if longest < STILL_CELLS * grid.cell:
-            break
-    moved = Pose(float(yaw), float(x), float(y), pose.score, pose.overlap_cells)
-    before, after = (
-        compare_ground(source, target, one.hypothesis(centre_of(source.grid)), plane=plane)
-        for one in (pose, moved)
-    )
-    return moved if after.known and after.spread_m <= before.spread_m else pose
+
+    def __init__(self, source: Terrain, target: Terrain, *, plane: bool = False) -> None:
+        self.source, self.target, self.plane = source, target, plane
+        self._centre = centre_of(source.grid)
+        rows, columns = np.nonzero(source.mask)
+        places = source.grid.to_metres(np.column_stack([columns, rows]).astype(np.float64))
+        self._offset, self._height = places - self._centre, source.low[rows, columns].astype(np.float64)
+        self._inner = cv2.erode(target.mask, np.ones((3, 3), np.uint8))
+        north, east = np.gradient(target.low, target.grid.cell)
+        self._images = [image.astype(np.float32) for image in (target.low, east, -north)]
+
+    def settle(self, pose: Pose) -> tuple[Pose, GroundSpread]:
+        """Settle a pose about the centre of the source's raster.
+
+        Returns:
+            The pose where the grounds agree better there, else the one given, and how far they differ under
+            it.
+
+        """
+        before, moved = self._spread(pose), self._moved(pose)
+        if moved is None:
+            return pose, before
+        after = self._spread(moved)
+        return (moved, after) if after.known and after.spread_m <= before.spread_m else (pose, before)
+
+    def _spread(self, pose: Pose) -> GroundSpread:
+        return ground_spread(self.source, self.target, pose.hypothesis(self._centre), plane=self.plane)
+
+    def _moved(self, pose: Pose) -> Pose | None:
+        """Return where a pose moves to; None where too few cells lie on ground that both see."""
+        grid = self.target.grid
+        if len(self._offset) < FEWEST_CELLS:
+            return None
+        yaw, x, y = pose.yaw, pose.east, pose.north
+        for _ in range(SETTLING_STEPS):
+            c, s = np.cos(yaw), np.sin(yaw)
+            turned = self._offset @ np.array([[c, s], [-s, c]])
+            px = grid.to_pixel(turned + [x, y]).astype(np.float32)
+            at = px[:, :1], px[:, 1:]
+            known = cv2.remap(self._inner, *at, cv2.INTER_LINEAR)[:, 0] > KNOWN
+            if known.sum() < 3 * FEWEST_CELLS:
+                return None
+            low, to_east, to_north = (
+                cv2.remap(image, *at, cv2.INTER_LINEAR)[known, 0].astype(np.float64) for image in self._images
+            )
+            here = turned[known]
+            level = [np.ones(len(here)), *here.T] if self.plane else [np.ones(len(here))]
+            J = np.column_stack([to_east, to_north, to_north * here[:, 0] - to_east * here[:, 1], *level])
+            rest = self._height[known] - low
+            rest -= np.median(rest)
+            scale = max(1.4826 * float(np.median(np.abs(rest))), NOISE_M / 2)
+            weight = 1.0 / (1.0 + (rest / (2.0 * scale)) ** 2)
+            # flat ground tells nothing: a step of a cell, or of what turns the rim by one, costs as much as
+            # noise
+            rim = float(np.hypot(*here.T).max())
+            held = np.zeros(J.shape[1])
+            held[:3] = np.array([1.0, 1.0, rim]) * NOISE_M / grid.cell
+            weighed = (J * weight[:, None] ** 2).T
+            step = np.linalg.solve(weighed @ J + np.diag(held**2 + 1e-12), weighed @ rest)
+            longest = max(float(np.hypot(step[0], step[1])), abs(step[2]) * rim)
+            step *= min(1.0, 2.0 * grid.cell / max(longest, 1e-12))
+            x, y, yaw = x + step[0], y + step[1], yaw + step[2]
+            if longest < STILL_CELLS * grid.cell:
+                break
+        return Pose(float(yaw), float(x), float(y), pose.score, pose.overlap_cells)
 
 
 def closest(
@@ -269,14 +293,14 @@ def closest(
         source, target: both terrains.
         poses: candidates, best first; the first is kept whatever it comes to.
         count: how many to keep at most.
-        plane: see `settle`.
+        plane: see `Settling`.
 
     """
     relief = float(np.std(source.low[source.mask > 0])) if source.mask.any() else 0.0
+    settling = Settling(source, target, plane=plane)
     ranked: list[tuple[float, Pose]] = []
     for number, pose in enumerate(poses):
-        moved = settle(source, target, pose, plane=plane)
-        found = compare_ground(source, target, moved.hypothesis(centre_of(source.grid)), plane=plane)
+        moved, found = settling.settle(pose)
         if found.known:
             ratio = np.log((relief + NOISE_M / 2) / (found.spread_m + NOISE_M / 2))
             ranked.append((np.inf if number == 0 else float(np.sqrt(found.cells) * ratio), moved))

@@ -33,6 +33,8 @@ BLOCK = 32_768
 """Points that are brought onto a grid at a time."""
 
 OCCUPANCY_CELL_M = 2.0
+SAMPLED_PER_CELL = 4.0
+"""Mean points of a sample that the occupied cells hold at least: of fewer, many would seem empty."""
 FINEST_AUTO_CELL_M = 0.25
 CELLS_PER_EXTENT = 200.0
 FINEST_BY_EXTENT_M = 1.0
@@ -62,6 +64,26 @@ def grid_around(minimum: Floats, maximum: Floats, cell: float) -> Grid:
             "one, or remove points far from the rest"
         )
     return Grid(float(west * cell), float(north * cell), cell, width, height)
+
+
+def fitting_cell(
+    minimum: Floats, maximum: Floats, cell: float, most: int = MAX_CELLS, coarsest: float = np.inf
+) -> float:
+    """Double a cell until a grid over given bounds has so many cells at most.
+
+    Args:
+        minimum, maximum: (2,) or (3,) bounds, metres.
+        cell: the cell to begin with, metres.
+        most: cells at most.
+        coarsest: it is not doubled beyond this, metres, whatever the grid has then.
+
+    Returns:
+        The edge of the cell, metres.
+
+    """
+    while 2.0 * cell <= coarsest and np.prod((maximum[:2] - minimum[:2]) / cell + 1.0) > most:
+        cell *= 2.0
+    return cell
 
 
 class Rasteriser:
@@ -198,7 +220,8 @@ class Coverage:
 
     Attributes:
         points: points in the whole cloud.
-        occupied_m2: area of its occupied cells of 2 m, square metres.
+        occupied_m2: area of its occupied cells of 2 m, square metres; of larger ones, where it was measured
+            in a sparse sample or is very wide.
         box_m2: area of its levelled bounding box, square metres.
 
     """
@@ -216,15 +239,29 @@ class Coverage:
 def coverage_of(xyz: Floats, levelled: Floats | None = None, points: int | None = None) -> Coverage:
     """Measure how densely a cloud covers the ground.
 
+    In a sample of a cloud the occupied cells hold `SAMPLED_PER_CELL` points on average at least; cells of 2 m
+    are doubled until they do. Else the gaps of the sample, which the cloud does not have, would not count as
+    covered, and all of its points would seem to lie in the rest. Cells are larger too, up to the coarsest of
+    rasters, where 2 m would be too many.
+
     Args:
         xyz: (n, 3) the cloud, or a uniform sample of it, metres.
         levelled: (n, 3) the same, levelled, for the bounding box; `xyz` itself if None.
         points: number of points in the whole cloud; n if None.
 
+    Raises:
+        RegistrationError: if the cloud is too wide for cells of `COARSEST_AUTO_CELL_M`.
+
     """
     low, high = transforms.bounds(xyz[:, :2])
-    grid = grid_around(low, high, OCCUPANCY_CELL_M)
-    occupied = int((rasterise([xyz], grid).count > 0).sum()) * OCCUPANCY_CELL_M**2
+    cell = fitting_cell(low, high, OCCUPANCY_CELL_M, coarsest=COARSEST_AUTO_CELL_M)
+    bev = rasterise([xyz], grid_around(low, high, cell))
+    filled = int(np.count_nonzero(bev.count))
+    sampled = points is not None and points > len(xyz)
+    while sampled and len(xyz) < SAMPLED_PER_CELL * filled and max(bev.grid.shape) > 1:
+        bev = coarsen(bev, 2)
+        filled = int(np.count_nonzero(bev.count))
+    occupied = filled * bev.grid.cell**2
     low, high = (low, high) if levelled is None else transforms.bounds(levelled[:, :2])
     return Coverage(len(xyz) if points is None else points, occupied, float(np.prod(high - low)))
 

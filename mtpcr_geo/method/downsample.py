@@ -25,6 +25,9 @@ _BLOCK = 131_072
 
 LATTICE_M = 0.00037
 """Shift of the voxels off the axes, on which points of an exact grid lie."""
+LOTS_A_VOXEL = 10
+"""Cells along a voxel in which points that are taken as they are draw one lot: were they finer, a hair's
+shift of the axes would draw others; were they coarser, neighbours would come and go together."""
 
 
 def near(points: Floats, others: Floats, distance: float) -> Mask:
@@ -119,7 +122,8 @@ class Thinned:
     Attributes:
         points: (m, 3) metres.
         lots: (m,) from 0 to 1, by chance: points whose lots lie below a share are about that share of them.
-            A point keeps its lot where others come or go, as long as the lattice stays.
+            A point's lot follows from where it lies along the cloud's own axes: it keeps it in another order
+            of the points, and where others come or go, as long as the lattice stays.
 
     """
 
@@ -149,7 +153,8 @@ def thinned(xyz: Floats, around: Mask, voxel: float, T_axes: Floats | None = Non
 
     It does not matter how the cloud is turned, and little which points at the edge are among them. Dense
     clouds give one mean point a voxel. Where voxels would hold hardly more than a point each, the points are
-    taken as they are, since another lattice of voxels would cut them otherwise.
+    taken as they are, since another lattice of voxels would cut them otherwise. Nor does it matter in which
+    order the points come.
 
     Args:
         xyz: (n, 3) points, metres.
@@ -174,11 +179,12 @@ def thinned(xyz: Floats, around: Mask, voxel: float, T_axes: Floats | None = Non
     placed -= corner
     thin = np.asarray(small_gicp.voxelgrid_sampling(placed, voxel, 1).points())[:, :3]
     if len(placed) < DENSE_VOXELS * len(thin):
-        names, thin = number[:, None], placed
+        points = xyz[number]
+        names = np.floor(placed * (LOTS_A_VOXEL / voxel)) + first * LOTS_A_VOXEL
     else:
-        names = (np.floor(thin / voxel) + first).astype(np.int64)
-    points = transforms.apply(transforms.inverse(T_axes), thin + corner)
-    return Thinned(points, _hash(names).astype(np.float64) * 2.0**-64)
+        points = transforms.apply(transforms.inverse(T_axes), thin + corner)
+        names = np.floor(thin / voxel) + first
+    return Thinned(points, _hash(names.astype(np.int64)).astype(np.float64) * 2.0**-64)
 
 
 def _hash(names: NDArray[np.int64]) -> NDArray[np.uint64]:

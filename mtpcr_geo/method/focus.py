@@ -131,8 +131,8 @@ def overlap_share(T: Floats, source: Floats, target: Floats) -> float:
         source, target: (n, 3) and (m, 3) levelled points, metres.
 
     """
-    overlap = overlap_of(transforms.apply(T, source), target)
     moved = transforms.apply(T, source)
+    overlap = overlap_of(moved, target)
     return min(float(overlap.select(moved).mean()), float(overlap.select(target).mean()))
 
 

@@ -87,18 +87,25 @@ def enhance(image: Grey, gain: Gain = "saturated") -> Grey:
     return np.asarray(np.clip(np.rint(twice), 0, 255), np.uint8)
 
 
-def masked_blur(image: Image, mask: Image, sigma_cells: float) -> Image:
+def masked_blur(image: Image, mask: Image, sigma_cells: float, weight: Image | None = None) -> Image:
     """Gaussian mean over the filled cells only (normalised convolution).
 
     Args:
         image: (h, w) values, 0 where empty.
         mask: (h, w) 1 where filled, 0 where empty.
         sigma_cells: standard deviation in cells.
+        weight: (h, w) the same mean of the mask, where it is known; see `blurred_mask`.
 
     """
-    weight = cv2.GaussianBlur(mask, (0, 0), sigma_cells, borderType=cv2.BORDER_CONSTANT)
+    if weight is None:
+        weight = blurred_mask(mask, sigma_cells)
     total = cv2.GaussianBlur(image * mask, (0, 0), sigma_cells, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(total / np.maximum(weight, _TINY_WEIGHT), np.float32)
+
+
+def blurred_mask(mask: Image, sigma_cells: float) -> Image:
+    """Gaussian mean of a mask, (h, w): the weight of the filled cells about each."""
+    return np.asarray(cv2.GaussianBlur(mask, (0, 0), sigma_cells, borderType=cv2.BORDER_CONSTANT), np.float32)
 
 
 def filled_height(bev: Bev) -> tuple[Image, Image]:
@@ -109,30 +116,32 @@ def filled_height(bev: Bev) -> tuple[Image, Image]:
     return np.asarray(height, np.float32), filled.astype(np.float32)
 
 
-def band_pass(height: Image, mask: Image, cell: float) -> Image:
+def band_pass(height: Image, mask: Image, cell: float, weight: Image | None = None) -> Image:
     """Height above its surroundings: smoothed by 0.7 cell, less the mean over 12 m, clipped to 8 m.
 
     Args:
         height: (h, w) metres, 0 where empty.
         mask: (h, w) 1 where filled.
         cell: edge of a cell, metres.
+        weight: (h, w) mean of the mask over 12 m, where it is known.
 
     Returns:
         (h, w) metres, 0 where empty.
 
     """
-    wide = masked_blur(height, mask, max(WIDE_SIGMA_M / cell, 1.5))
+    wide = masked_blur(height, mask, _wide_sigma(cell), weight)
     fine = masked_blur(height, mask, FINE_SIGMA_CELLS)
     return np.asarray(np.clip(fine - wide, -HEIGHT_CLIP_M, HEIGHT_CLIP_M) * mask, np.float32)
 
 
-def step_edges(height: Image, mask: Image, cell: float) -> Image:
+def step_edges(height: Image, mask: Image, cell: float, weight: Image | None = None) -> Image:
     """Height steps: the range within 3 x 3 filled cells, 1..6 m mapped to 0..1, locally centred.
 
     Args:
         height: (h, w) metres, 0 where empty.
         mask: (h, w) 1 where filled.
         cell: edge of a cell, metres.
+        weight: (h, w) mean of the mask over 12 m, where it is known.
 
     Returns:
         (h, w) unitless, 0 where empty, with zero mean over 12 m.
@@ -143,8 +152,13 @@ def step_edges(height: Image, mask: Image, cell: float) -> Image:
     high = cv2.dilate(np.where(mask > 0, height, -far), window)
     low = cv2.erode(np.where(mask > 0, height, far), window)
     step = np.clip((high - low - STEP_FLOOR_M) / STEP_RANGE_M, 0.0, 1.0).astype(np.float32) * mask
-    centred = step - masked_blur(step, mask, max(WIDE_SIGMA_M / cell, 1.5))
+    centred = step - masked_blur(step, mask, _wide_sigma(cell), weight)
     return np.asarray(centred * mask, np.float32)
+
+
+def _wide_sigma(cell: float) -> float:
+    """Return the standard deviation of the wide mean, in cells of some metres."""
+    return max(WIDE_SIGMA_M / cell, 1.5)
 
 
 @dataclass(frozen=True)
@@ -171,7 +185,10 @@ class Channels:
 def channels(bev: Bev) -> Channels:
     """Make the correlation channels of a height raster."""
     height, mask = filled_height(bev)
-    return Channels(band_pass(height, mask, bev.grid.cell), step_edges(height, mask, bev.grid.cell), mask)
+    cell = bev.grid.cell
+    # both take off a wide mean over the same cells: its weights are a third of the work
+    weight = blurred_mask(mask, _wide_sigma(cell))
+    return Channels(band_pass(height, mask, cell, weight), step_edges(height, mask, cell, weight), mask)
 
 
 def band_image(bev: Bev) -> Grey:

@@ -13,10 +13,12 @@ from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.groups import Groups
 from mtpcr_geo.core.types import Bev
-from mtpcr_geo.method.bev import BLOCK, grid_around, rasterise
+from mtpcr_geo.method.bev import BLOCK, MAX_CELLS, fitting_cell, grid_around, rasterise
 from mtpcr_geo.method.ground import connected_ground
 
 OVERLAP_CELL_M = 2.0
+MOST_OVERLAP_CELLS = MAX_CELLS // 4
+"""Cells of the grid of an overlap at most: some images of as many are held for each cloud."""
 LOW_RADIUS_M = 6.0
 LOW_ABOVE_M = 0.7
 SLOPE_RADIUS_M = 8.0
@@ -148,12 +150,16 @@ class Overlap:
         """
         cell = self.grid.cell
         both = (self.source.count > 0) & (self.target.count > 0)
+        slopes = []
         for bev in (self.source, self.target):
-            both &= connected_ground(bev.low, _lies_low(bev.low, cell), cell)
+            lowest = _lowest_near(bev.low, cell)
+            slopes.append(_slope(lowest, cell))
+            both &= connected_ground(bev.low, _lies_low(bev.low, lowest, slopes[-1], cell), cell)
         row, column = np.nonzero(both)
         xy = self.grid.to_metres(np.column_stack([column, row]).astype(np.float64))
         heights = [
-            _ground(xyz, bev) for xyz, bev in zip(self.points, (self.source, self.target), strict=True)
+            _ground(xyz, bev, slope)
+            for xyz, bev, slope in zip(self.points, (self.source, self.target), slopes, strict=True)
         ]
         return CommonGround(xy, heights[0][both], heights[1][both], self.grid.cell)
 
@@ -175,13 +181,16 @@ def overlap_of(
 
     Args:
         source, target: (n, 3) and (m, 3) metres in one frame.
-        cell: edge of a cell, metres.
+        cell: edge of a cell, metres; doubled until the grid has `MOST_OVERLAP_CELLS` at most, which cells of
+            2 m are for a square of 8 km. What came of it is the grid's.
         margin_cells: cells by which a filled cell counts around itself.
 
     """
     (low_s, high_s), (low_t, high_t) = transforms.bounds(source), transforms.bounds(target)
     low, high = np.maximum(low_s, low_t) - 2 * cell, np.minimum(high_s, high_t) + 2 * cell
-    grid = grid_around(low, np.maximum(high, low + cell), cell)
+    high = np.maximum(high, low + cell)
+    cell = fitting_cell(low, high, cell, MOST_OVERLAP_CELLS)
+    grid = grid_around(low, high, cell)
     source, target = (_nearby(grid, xyz) for xyz in (source, target))
     s, t = rasterise([source], grid), rasterise([target], grid)
     window = np.ones((2 * margin_cells + 1, 2 * margin_cells + 1), np.uint8)
@@ -195,14 +204,14 @@ def _nearby(grid: Grid, xyz: Floats) -> Floats:
     return xyz if len(near) > MOST * len(xyz) else np.asarray(xyz[near])
 
 
-def _ground(xyz: Floats, bev: Bev) -> Floats:
+def _ground(xyz: Floats, bev: Bev, slope: NDArray[np.float32]) -> Floats:
     """Return the mean height of the lowest layer of each cell, (h, w) metres, NaN where empty.
 
     The single lowest point lies the lower the denser and the noisier a cloud is; the mean of what lies
     little above it does not. On a slope the layer is as much thicker as the ground rises within the cell.
     """
     grid, low = bev.grid, bev.low.ravel()
-    thick = (GROUND_LAYER_M + _slope(bev.low, grid.cell) * grid.cell).ravel()
+    thick = (GROUND_LAYER_M + slope * grid.cell).ravel()
     size = grid.width * grid.height
     count, total = np.zeros(size), np.zeros(size)
     for start in range(0, len(xyz), GROUND_BLOCK):
@@ -218,12 +227,16 @@ def _ground(xyz: Floats, bev: Bev) -> Floats:
         return np.asarray(bev.low.astype(np.float64) + (total / count).reshape(grid.shape))
 
 
-def _slope(low: NDArray[np.float32], cell: float) -> NDArray[np.float32]:
-    """Return the slope of the ground over some cells, rise over run, (h, w); 0 where it is not known."""
-    filled = np.isfinite(low)
-    if not filled.any():
-        return np.zeros(low.shape, np.float32)
-    lowest = _lowest_near(low, cell)
+def _slope(lowest: NDArray[np.float32], cell: float) -> NDArray[np.float32]:
+    """Return the slope of the ground over some cells, rise over run, (h, w); 0 where it is not known.
+
+    Args:
+        lowest: (h, w) lowest heights near by, metres, see `_lowest_near`.
+        cell: edge of a cell, metres.
+
+    """
+    if not np.isfinite(lowest).any():
+        return np.zeros(lowest.shape, np.float32)
     known = np.isfinite(lowest).astype(np.float32)
     base = np.where(known > 0, lowest - np.float32(np.nanmedian(lowest)), np.float32(0))
     sigma = max(SLOPE_RADIUS_M / cell, 1.0)
@@ -246,22 +259,22 @@ def _lowest_near(low: NDArray[np.float32], cell: float) -> NDArray[np.float32]:
     return np.where(np.isfinite(lowest), lowest, np.float32(np.nan)).astype(np.float32)
 
 
-def _lies_low(low: NDArray[np.float32], cell: float, above: float = LOW_ABOVE_M) -> Mask:
+def _lies_low(
+    low: NDArray[np.float32], lowest: NDArray[np.float32], slope: NDArray[np.float32], cell: float
+) -> Mask:
     """Mark cells whose lowest point is little above the lowest near by, as far as the ground's slope goes.
 
     Args:
         low: (h, w) lowest heights, metres, NaN where empty.
+        lowest: (h, w) lowest heights near by, metres, see `_lowest_near`.
+        slope: (h, w) of the ground, rise over run.
         cell: edge of a cell, metres.
-        above: metres above the lowest around that still count as ground on the level.
 
     """
-    filled = np.isfinite(low)
-    if not filled.any():
-        return filled
     radius = max(1, round(LOW_RADIUS_M / cell))
-    allowed = np.float32(above) + _slope(low, cell) * np.float32(radius * cell)
+    allowed = np.float32(LOW_ABOVE_M) + slope * np.float32(radius * cell)
     with np.errstate(invalid="ignore"):
-        return np.asarray(filled & (low - _lowest_near(low, cell) < allowed))
+        return np.asarray(np.isfinite(low) & (low - lowest < allowed))
 
 
 def _without_plane(xy: Floats, z: Floats) -> Floats:

@@ -162,5 +162,8 @@ def tolerance_for(cell: float) -> float:
 
 
 def ground_cell_for(cell: float) -> float:
-    """Choose the cell in which both clouds' ground is compared, metres, from the rasters' cell."""
+    """Choose the cell in which both clouds' ground is compared, metres, from the rasters' cell.
+
+    Overlaps of many kilometres are compared in larger ones, see `mtpcr_geo.method.overlap.overlap_of`.
+    """
     return float(np.clip(2.0 * cell, MIN_GROUND_CELL_M, MAX_GROUND_CELL_M))

@@ -18,8 +18,9 @@ from mtpcr_geo.match.terrain import (
     Terrain,
     cell_to_compare,
     compare_ground,
+    ground_spread,
 )
-from mtpcr_geo.match.terrain_search import TerrainSearch, closest, propose, settle
+from mtpcr_geo.match.terrain_search import Settling, TerrainSearch, closest, propose
 from mtpcr_geo.method.bev import grid_around, rasterise
 from mtpcr_geo.method.scales import scales_of
 
@@ -222,7 +223,7 @@ def test_a_pose_settles_where_the_grounds_agree(source, target, turn_deg, east, 
     s, t = terrain_of(source), terrain_of(target)
     true = pose_of(TRUE, centre_of(s.grid))
     start = Pose(true.yaw + np.radians(turn_deg), true.east + east, true.north + north)
-    found = settle(s, t, start)
+    found, _ = Settling(s, t).settle(start)
     # the lowest of a cell of 4 m lies anywhere in it
     assert np.hypot(found.east - true.east, found.north - true.north) < 1.0
     assert np.degrees(angle_between(found.yaw, true.yaw)) < 0.5
@@ -231,20 +232,31 @@ def test_a_pose_settles_where_the_grounds_agree(source, target, turn_deg, east, 
     assert after <= before
 
 
+@pytest.mark.parametrize("plane", [False, True])
+@pytest.mark.parametrize("east", [0.0, 3.0, 5000.0])
+def test_a_settled_pose_comes_with_its_comparison(source, target, east: float, plane: bool) -> None:
+    s, t = terrain_of(source), terrain_of(target)
+    true, centre = pose_of(TRUE, centre_of(s.grid)), centre_of(s.grid)
+    pose, spread = Settling(s, t, plane=plane).settle(Pose(true.yaw, true.east + east, true.north))
+    whole = compare_ground(s, t, pose.hypothesis(centre), plane=plane)
+    assert (spread.cells, spread.spread_m, spread.known) == (whole.cells, whole.spread_m, whole.known)
+    assert spread == ground_spread(s, t, pose.hypothesis(centre), plane=plane)
+
+
 def test_a_tilted_ground_settles_where_a_plane_is_free(source, target) -> None:
     s, t = terrain_of(source), terrain_of(target)
     x = s.grid.to_metres(np.column_stack([np.arange(s.grid.width), np.zeros(s.grid.width)]))[:, 0]
     leaning = replace(s, low=(s.low + np.float32(0.05) * x[None, :].astype(np.float32)) * s.mask)
     true = pose_of(TRUE, centre_of(s.grid))
     start = Pose(true.yaw + 0.02, true.east + 4.0, true.north - 3.0)
-    found = settle(leaning, t, start, plane=True)
+    found, _ = Settling(leaning, t, plane=True).settle(start)
     assert np.hypot(found.east - true.east, found.north - true.north) < 1.5
 
 
 def test_poses_far_from_any_ground_stay_where_they_are(source, target) -> None:
     s, t = terrain_of(source), terrain_of(target)
     away = Pose(0.3, 5000.0, 5000.0)
-    assert settle(s, t, away) == away
+    assert Settling(s, t).settle(away)[0] == away
     assert closest(s, t, [away], 3) == []
 
 

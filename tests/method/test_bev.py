@@ -62,6 +62,36 @@ def test_density_counts_occupied_ground_only() -> None:
     assert coverage_of(both).per_m2 == pytest.approx(coverage_of(xyz).per_m2, rel=0.2)
 
 
+@pytest.mark.parametrize("share", [0.04, 0.2, 0.999])
+def test_the_density_of_a_sample_is_that_of_the_cloud(share: float) -> None:
+    rng = np.random.default_rng(5)
+    wide, per_m2 = 1200.0, 0.5
+    whole = rng.uniform(0.0, wide, (round(per_m2 * wide**2), 3))
+    sample = whole[rng.random(len(whole)) < share]
+    found = coverage_of(sample, points=len(whole))
+    assert found.per_m2 == pytest.approx(per_m2, rel=0.1)
+    assert found.occupied_m2 == pytest.approx(wide**2, rel=0.1)
+    assert choose_cell([found.per_m2]) == choose_cell([per_m2])
+
+
+def test_a_whole_cloud_is_measured_in_cells_of_two_metres_however_sparse() -> None:
+    xyz = np.random.default_rng(6).uniform(0.0, 400.0, (3000, 3))
+    assert coverage_of(xyz).occupied_m2 == coverage_of(xyz, points=len(xyz)).occupied_m2 <= 4.0 * len(xyz)
+
+
+def test_a_sample_of_a_few_points_far_apart_has_a_density() -> None:
+    few = np.array([[1.0, 1.0, 0.0], [901.0, 1.0, 0.0], [1.0, 901.0, 0.0]])
+    assert 0.0 < coverage_of(few, points=1000).per_m2 < 1.0
+    assert coverage_of(few[:1], points=1000).occupied_m2 == 4.0
+
+
+def test_a_cloud_wider_than_cells_of_two_metres_fit_has_a_density() -> None:
+    xyz = np.random.default_rng(7).uniform(0.0, 1.0, (2000, 3)) * [20_000.0, 20_000.0, 10.0]
+    assert coverage_of(xyz).per_m2 == pytest.approx(1 / 16, rel=0.02)
+    with pytest.raises(RegistrationError, match="too large"):
+        coverage_of(xyz * [5.0, 5.0, 1.0])
+
+
 def test_the_sparser_cloud_sets_the_cell() -> None:
     rng = np.random.default_rng(4)
     dense = coverage_of(rng.uniform(0, 100, (100_000, 3))).per_m2

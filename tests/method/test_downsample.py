@@ -74,6 +74,51 @@ def test_a_share_of_points_in_rows_leaves_no_row_out(across: int) -> None:
             assert abs(rows.sum(axis=1) - wanted).max() < 5 * sigma
 
 
+def places(cloud: Thinned) -> set[tuple[float, ...]]:
+    return set(map(tuple, np.round(cloud.points, 6).tolist()))
+
+
+@pytest.mark.parametrize("density", [3.0, 300.0])
+def test_the_order_of_the_points_does_not_matter(density: float) -> None:
+    rng = np.random.default_rng(26)
+    xyz = plot(rng, density=density)
+    here = thinned(xyz, everything(xyz), 0.5)
+    there = thinned(rng.permutation(xyz), everything(xyz), 0.5)
+    wanted = len(here.points) // 4, len(here.points)
+    kept = places(here.reduced(*wanted))
+    assert 0.15 * len(here.points) < len(kept) < 0.3 * len(here.points)
+    # a coordinate on the edge of a cell of the lattice may round to either side
+    assert len(kept ^ places(there.reduced(*wanted))) <= 2
+
+
+def test_one_point_less_changes_few_of_those_kept() -> None:
+    # as many points as are thinned in earnest; of square plots the axes themselves hang on single points
+    rng = np.random.default_rng(27)
+    xyz = rng.uniform(0.0, 1.0, (60_000, 3)) * [200.0, 80.0, 0.3]
+    xyz[:, 2] += np.sin(xyz[:, 0] / 9.0) + 2.0 * np.cos(xyz[:, 1] / 7.0)
+    kept = places(thinned(xyz, everything(xyz), 0.5).reduced(2000, 8000))
+    assert len(kept) > 10_000
+    outermost = int(np.argmax(xyz[:, 0] + xyz[:, 1]))
+    for lost in (0, len(xyz) // 2, outermost):
+        less = np.delete(xyz, lost, axis=0)
+        again = places(thinned(less, everything(less), 0.5).reduced(2000, 8000))
+        assert len(kept & again) >= 0.9 * len(kept)
+
+
+@pytest.mark.parametrize("spacing", [0.25, 0.4, 0.5])
+def test_a_gridded_cloud_is_thinned_evenly(spacing: float) -> None:
+    rows, columns = 200, 144
+    j, i = np.mgrid[0:rows, 0:columns]
+    xyz = np.column_stack([spacing * i.ravel(), spacing * j.ravel(), 0.02 * (i + j).ravel()])
+    voxel = 1.2 * spacing
+    cloud = thinned(xyz, everything(xyz), voxel)
+    assert len(cloud.points) == len(xyz)
+    kept = (cloud.lots < 0.25).reshape(rows, columns)
+    for lines in (kept, kept.T):
+        sigma = np.sqrt(0.25 * 0.75 * lines.shape[1])
+        assert abs(lines.sum(axis=1) - 0.25 * lines.shape[1]).max() < 5 * sigma
+
+
 def test_reducing_keeps_about_what_is_wanted_and_moves_by_steps() -> None:
     lots = np.random.default_rng(25).random(40_000)
     cloud = Thinned(np.column_stack([lots, lots, lots]), lots)

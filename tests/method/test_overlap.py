@@ -7,9 +7,23 @@ import pytest
 from helpers_plots import plot, terrain
 
 from mtpcr_geo.core import transforms
+from mtpcr_geo.core.types import Bev
 from mtpcr_geo.method.bev import grid_around, rasterise
-from mtpcr_geo.method.overlap import CommonGround, _ground, overlap_of
+from mtpcr_geo.method.overlap import (
+    MOST_OVERLAP_CELLS,
+    OVERLAP_CELL_M,
+    CommonGround,
+    _ground,
+    _lowest_near,
+    _slope,
+    overlap_of,
+)
 from mtpcr_geo.method.settle import settle_on_ground
+
+
+def slope_of(bev: Bev) -> np.ndarray:
+    """(h, w) slope of a raster's ground, rise over run."""
+    return _slope(_lowest_near(bev.low, bev.grid.cell), bev.grid.cell)
 
 
 def hillside(seed: int, slope: float, n: int = 60_000, extent: float = 120.0) -> np.ndarray:
@@ -57,7 +71,7 @@ def test_a_denser_cloud_has_no_lower_ground(noise: float, slope: float) -> None:
         xy = rng.uniform(0.0, 40.0, (400 * per_cell, 2))
         xyz = np.column_stack([xy, slope * xy[:, 0] + rng.normal(0.0, noise, len(xy))])
         bev = rasterise([xyz], grid)
-        heights.append(_ground(xyz, bev))
+        heights.append(_ground(xyz, bev, slope_of(bev)))
         lowest.append(bev.low)
     bias = np.nanmedian(heights[1] - heights[0])
     assert abs(bias) < 0.02
@@ -76,7 +90,7 @@ def test_height_is_settled_across_densities() -> None:
 def test_empty_cells_have_no_ground() -> None:
     xyz = hillside(7, 0.3, 4000, 40.0)
     bev = rasterise([xyz[xyz[:, 0] > 0.0]], grid_around(np.full(2, -20.0), np.full(2, 20.0), 2.0))
-    ground = _ground(xyz[xyz[:, 0] > 0.0], bev)
+    ground = _ground(xyz[xyz[:, 0] > 0.0], bev, slope_of(bev))
     assert np.array_equal(np.isfinite(ground), bev.count > 0)
     filled = bev.count > 0
     assert (ground[filled] >= bev.low[filled] - 1e-6).all()
@@ -113,3 +127,18 @@ def test_noise_of_the_ground_explains_the_spread_under_the_right_place_alone() -
 def test_too_little_ground_has_no_shape() -> None:
     few = hillside(3, 0.0, 200, 8.0)
     assert not np.isfinite(overlap_of(few, few).common_ground().shape().spread_m)
+
+
+def test_an_overlap_of_many_kilometres_takes_larger_cells() -> None:
+    rng = np.random.default_rng(11)
+    wide = 20_000.0
+    xy = rng.uniform(0.0, wide, (3000, 2))
+    xyz = np.column_stack([xy, 30.0 * np.sin(xy[:, 0] / 900.0)])
+    overlap = overlap_of(xyz, xyz + [0.0, 0.0, 0.3])
+    assert overlap.grid.cell > OVERLAP_CELL_M
+    assert overlap.grid.width * overlap.grid.height <= MOST_OVERLAP_CELLS
+    assert overlap.select(xyz).mean() > 0.99
+    assert np.median(overlap.ground_steps()[1]) == pytest.approx(0.3, abs=1e-5)
+    # clouds of that size that share a corner only keep their cells
+    corner = overlap_of(xyz, xyz + [wide - 500.0, wide - 500.0, 0.0])
+    assert corner.grid.cell == OVERLAP_CELL_M
