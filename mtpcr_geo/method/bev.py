@@ -54,7 +54,8 @@ def grid_around(minimum: Floats, maximum: Floats, cell: float) -> Grid:
         RegistrationError: if the raster would not fit into memory at that cell size.
 
     """
-    west, south = np.floor(np.asarray(minimum[:2]) / cell)
+    # a cell holds its western and its northern edge
+    west, south = np.floor(minimum[0] / cell), np.ceil(minimum[1] / cell) - 1
     east, north = np.floor(np.asarray(maximum[:2]) / cell) + 1
     width, height = int(east - west), int(north - south)
     if width * height > MAX_CELLS:

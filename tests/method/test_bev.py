@@ -5,7 +5,7 @@ import pytest
 
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.grid import Grid
-from mtpcr_geo.method.bev import choose_cell, coarsen, coverage_of, grid_around, rasterise
+from mtpcr_geo.method.bev import choose_cell, coarsen, coverage_of, grid_around, make_bev, rasterise
 
 
 def test_hand_worked_cells() -> None:
@@ -103,3 +103,11 @@ def test_the_sparser_cloud_sets_the_cell() -> None:
 def test_a_raster_too_large_is_refused_with_the_way_out() -> None:
     with pytest.raises(RegistrationError, match="coarser cell"):
         grid_around(np.zeros(2), np.full(2, 1e6), 0.5)
+
+
+def test_points_of_an_exact_grid_all_lie_in_their_raster():
+    x, y = np.meshgrid(np.arange(5.0, 9.0), np.arange(-3.0, 4.0))
+    xyz = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)])
+    for cell in (0.5, 1.0, 2.0):
+        bev = make_bev(xyz, cell)
+        assert int(bev.count.sum()) == len(xyz)
