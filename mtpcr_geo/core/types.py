@@ -156,6 +156,7 @@ class Side(ComparesArrays):
         strays: points that lie far from all others, likewise.
         box: (2, 3) file coordinates beyond which these lie; None where there are none.
         remarks: what the points say otherwise than the header of the file, a sentence each.
+        near: (k, 3) work coordinates about the other cloud, denser than the sample there; None if it is not.
 
     """
 
@@ -173,6 +174,7 @@ class Side(ComparesArrays):
     strays: int = 0
     box: Floats | None = None
     remarks: tuple[str, ...] = ()
+    near: Floats | None = None
 
     @property
     def T_level_work(self) -> Floats:

@@ -54,14 +54,14 @@ def near(points: Floats, others: Floats, distance: float) -> Mask:
     filled = np.zeros(tuple(shape.tolist()), dtype=np.bool_)
     for start in range(0, len(others), _BLOCK):
         some = others[start : start + _BLOCK]
-        filled[_voxels(some[_within(some, low, high)], first, edge)] = True
+        filled[_voxels(some[between(some, low, high)], first, edge)] = True
     for axis in range(3):
         # voxels beside a filled one along each axis in turn: all 26 neighbours in the end
         ahead, behind = np.roll(filled, 1, axis), np.roll(filled, -1, axis)
         filled = filled | ahead | behind
     for start in range(0, len(points), _BLOCK):
         some = points[start : start + _BLOCK]
-        inside = np.flatnonzero(_within(some, low, high))
+        inside = np.flatnonzero(between(some, low, high))
         found[start + inside] = filled[_voxels(some[inside], first, edge)]
     return found
 
@@ -74,8 +74,8 @@ def _edge_of(low: Floats, high: Floats, least: float) -> float:
     return edge
 
 
-def _within(xyz: Floats, low: Floats, high: Floats) -> Mask:
-    """Mark (n, 3) points between two corners."""
+def between(xyz: Floats, low: Floats, high: Floats) -> Mask:
+    """Return which of (n, 3) points lie between two corners, (3,) each, all in the same coordinates: (n,)."""
     inside = np.ones(len(xyz), bool)
     for axis in range(3):
         inside &= (xyz[:, axis] >= low[axis]) & (xyz[:, axis] <= high[axis])
@@ -170,7 +170,7 @@ def thinned(xyz: Floats, around: Mask, voxel: float, T_axes: Floats | None = Non
     block = REGION_VOXELS * voxel
     low, high = transforms.bounds(xyz[around])
     far = 2.0 * np.sqrt(3.0) * block
-    number = np.flatnonzero(_within(xyz, low - far, high + far))
+    number = np.flatnonzero(between(xyz, low - far, high + far))
     placed = transforms.apply(T_axes, xyz[number])
     beside = near(placed, placed[around[number]], block)
     number, placed = number[beside], placed[beside]

@@ -1,4 +1,7 @@
-"""A pair seen with its target upright: what looks at the ground, or at what stands on it, needs z up."""
+"""What refinement and verdict look at: the points about the overlap, and the target upright.
+
+Whatever looks at the ground, or at what stands on it, needs z up.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mtpcr_geo.core.types import Pair
+from mtpcr_geo.core import transforms
+from mtpcr_geo.core.arrays import Floats
+from mtpcr_geo.core.types import Pair, Side
 
 
 def seen_upright(pair: Pair) -> Pair:
@@ -25,9 +30,20 @@ def seen_upright(pair: Pair) -> Pair:
     T_level = pair.target.T_level_work
     if np.array_equal(T_level, np.eye(4)):
         return pair
-    levelling = replace(pair.target.levelling, T_level_work=np.eye(4))
+    target = pair.target
+    upright = replace(
+        target,
+        sample=target.levelled_sample,
+        levelling=replace(target.levelling, T_level_work=np.eye(4)),
+        near=None if target.near is None else transforms.apply(T_level, target.near),
+    )
     return pair.with_(
-        target=replace(pair.target, sample=pair.target.levelled_sample, levelling=levelling),
+        target=upright,
         T_target_source=None if pair.T_target_source is None else T_level @ pair.T_target_source,
         refinement=None if pair.refinement is None else pair.refinement.in_frame(T_level),
     )
+
+
+def points_near(side: Side) -> Floats:
+    """Return a side's points about the other cloud, (n, 3) work coordinates: its sample, or denser ones."""
+    return side.sample if side.near is None else side.near

@@ -19,7 +19,7 @@ from mtpcr_geo.method.overlap import overlap_of
 from mtpcr_geo.method.scales import MAX_LEAST_OVERLAP_M2, ground_cell_for, scales_of, tolerance_for
 from mtpcr_geo.method.shortcomings import what_is_missing
 from mtpcr_geo.method.solve import solve_tie_points
-from mtpcr_geo.method.upright import seen_upright
+from mtpcr_geo.method.upright import points_near, seen_upright
 from mtpcr_geo.verdict.findings import UNBOUNDED_CHANCE
 from mtpcr_geo.verdict.further import with_further
 from mtpcr_geo.verdict.limits import Evidence
@@ -62,8 +62,9 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
     # ground and what stands on it are told apart along the vertical
     seen = seen_upright(pair)
     assert seen.T_target_source is not None
-    moved = transforms.apply(seen.T_target_source, pair.source.sample)
-    overlap = overlap_of(moved, seen.target.sample, ground_cell_for(cell))
+    moved = transforms.apply(seen.T_target_source, points_near(pair.source))
+    overlap = overlap_of(moved, points_near(seen.target), ground_cell_for(cell))
+    whole = moved if pair.source.near is None else transforms.apply(seen.T_target_source, pair.source.sample)
     ground = overlap.common_ground()
     shape = ground.shape()
     icp = pair.refinement.icp if pair.refinement is not None else None
@@ -76,7 +77,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         margin=matches.margin if matches is not None else None,
         support=matches.support if matches is not None else None,
         overlap_m2=overlap.area_m2,
-        overlap_source=float(overlap.select(moved).mean()),
+        overlap_source=float(overlap.select(whole).mean()),
         overlap_target=float(overlap.select(seen.target.sample).mean()),
         ground_cells=len(ground.step),
         ground_agreeing=int((np.abs(ground.step) < GROUND_AGREES_M).sum()),
@@ -101,7 +102,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
             if side.levelling.method == "none" and not side.levelling.trusted
         ),
     )
-    del moved  # as large as the source
+    del moved, whole  # as large as the source
     evidence, further = with_further(evidence, seen, overlap, ground, tie_points, agreeing)
     if seen is not pair and evidence.uncertainty is not None:
         evidence = replace(evidence, uncertainty=_in_work_frame(evidence.uncertainty, pair))
@@ -217,8 +218,8 @@ def agreement(pair: Pair, T: Floats, tolerance: float | None = None) -> tuple[in
     """
     seen = seen_upright(pair.with_(T_target_source=T, refinement=None))
     assert seen.T_target_source is not None
-    moved = transforms.apply(seen.T_target_source, pair.source.sample)
-    _, steps = overlap_of(moved, seen.target.sample, ground_cell_for(pair.cell)).ground_steps()
+    moved = transforms.apply(seen.T_target_source, points_near(pair.source))
+    _, steps = overlap_of(moved, points_near(seen.target), ground_cell_for(pair.cell)).ground_steps()
     return tie_points_agreeing(pair, T, tolerance), int((np.abs(steps) < GROUND_AGREES_M).sum())
 
 

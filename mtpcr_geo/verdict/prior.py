@@ -13,6 +13,7 @@ from mtpcr_geo.core.types import Pair
 from mtpcr_geo.method.icp import Surfaces
 from mtpcr_geo.method.refine import SAME_FIT
 from mtpcr_geo.method.scales import tolerance_for
+from mtpcr_geo.method.upright import points_near
 from mtpcr_geo.verdict.evidence import agreement
 
 _NAMES = {"georef": "the clouds' CRSs put", "file": "the prior given puts", "matrix": "the prior given puts"}
@@ -65,7 +66,7 @@ def prior_or_found(pair: Pair, tolerance: float | None = None) -> PriorCompariso
     poses = (pair.T_target_source, pair.T_prior)
     found, prior = (agreement(pair, T, tolerance) for T in poses)
     try:
-        surfaces = Surfaces(pair.source.sample, pair.target.sample, pair.T_target_source)
+        surfaces = Surfaces(points_near(pair.source), points_near(pair.target), pair.T_target_source)
     except RegistrationError:
         return PriorComparison(found, prior)
     return PriorComparison(found, prior, *(surfaces.surface_residual(T) for T in poses))

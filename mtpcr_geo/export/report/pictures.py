@@ -28,7 +28,7 @@ from mtpcr_geo.export.resample import cut_to, grid_around, placed, snapped, warp
 from mtpcr_geo.method.bev import coarsen
 from mtpcr_geo.method.overlap import CommonGround, overlap_of
 from mtpcr_geo.method.scales import ground_cell_for
-from mtpcr_geo.method.upright import seen_upright
+from mtpcr_geo.method.upright import points_near, seen_upright
 
 _ZOOM_PX = 760
 _PATCH_PX = 420
@@ -103,8 +103,8 @@ class Overlay:
         """The ground that both see, as the checks compare it."""
         seen = seen_upright(self.pair)
         assert seen.T_target_source is not None
-        moved = transforms.apply(seen.T_target_source, seen.source.sample)
-        return overlap_of(moved, seen.target.sample, ground_cell_for(seen.cell)).common_ground()
+        moved = transforms.apply(seen.T_target_source, points_near(seen.source))
+        return overlap_of(moved, points_near(seen.target), ground_cell_for(seen.cell)).common_ground()
 
     @cached_property
     def box(self) -> Window:

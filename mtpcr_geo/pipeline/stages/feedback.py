@@ -23,7 +23,7 @@ from mtpcr_geo.method.inverse_mapping import tie_points_of
 from mtpcr_geo.method.refine import FEW_TIE_POINTS, RefineSettings, refine, target_moves
 from mtpcr_geo.method.scales import tolerance_for
 from mtpcr_geo.method.solve import solve_tie_points
-from mtpcr_geo.method.upright import seen_upright
+from mtpcr_geo.method.upright import points_near, seen_upright
 from mtpcr_geo.pipeline.stages.views import shown, view_of
 from mtpcr_geo.verdict.evidence import middle_of_tie_points, moved_in_plan, tie_points_agreeing
 
@@ -239,7 +239,7 @@ def _met(pair: Pair, about: Floats, those: Sequence[Floats], settings: RefineSet
     NaN where there are none.
     """
     distance = max(max(one.max_correspondence_distances_m) for one in rounds_for(pair.cell).values())
-    clouds = pair.source.sample, pair.target.sample
+    clouds = points_near(pair.source), points_near(pair.target)
     if target_moves(*clouds):
         # the smaller cloud moves, as in the refinement, so that source and target exchanged say the same
         clouds, about, those = clouds[::-1], transforms.inverse(about), [*map(transforms.inverse, those)]
@@ -314,8 +314,8 @@ def refined_pair(pair: Pair, settings: RefineSettings) -> Refinement:
     seen = seen_upright(pair)
     assert seen.T_target_source is not None
     found = refine(
-        seen.source.sample,
-        seen.target.sample,
+        points_near(seen.source),
+        points_near(seen.target),
         seen.T_target_source,
         settings,
         cell=pair.cell,

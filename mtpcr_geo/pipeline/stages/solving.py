@@ -188,6 +188,7 @@ class Refine(Stage):
     def run(self, inputs: Sequence[Value], context: RunContext) -> Value | None:
         """Refine the solved transform."""
         from mtpcr_geo.method.refine import RefineSettings
+        from mtpcr_geo.pipeline.stages.closer import with_points_near
         from mtpcr_geo.pipeline.stages.feedback import (
             fed_back,
             matched_coarser,
@@ -199,6 +200,7 @@ class Refine(Stage):
         pair = self.one_pair(inputs)
         if pair.T_target_source is None:
             raise OptionError(f"{self.label} needs a transform; put mtpcr.solve before it")
+        pair = with_points_near(pair, context)
         options = self.options
         distances = options.max_correspondence_distance
         settings = RefineSettings(
