@@ -247,7 +247,7 @@ class _Check:
                     self.refuse(error, "unit", role)
                 return  # else it stands in the guess at a missing CRS
         try:
-            dense = coverage_of(sample, points=cloud.count)
+            dense = coverage_of(sample, points=None if inspection.scan.complete else cloud.count)
         except RegistrationError as error:
             inspection.too_large = error
             return

@@ -206,7 +206,8 @@ def leaves_heights_open(one: CRS, whole: CRS) -> bool:
         return False
     if facts.horizontal is None or other.horizontal is None or facts.height != "unsaid":
         return False
-    if facts.height_unit_stated and abs(facts.height_unit / other.height_unit - 1.0) > 1e-9:
+    # unsaid heights are in the unit of the plan
+    if abs(facts.height_unit / other.height_unit - 1.0) > 1e-9:
         return False
     return facts.kind == other.kind and same_place(facts.horizontal, other.horizontal)
 

@@ -245,7 +245,11 @@ def common_rasters(pair: Pair, margin_m: float = 15.0, max_side: int = 1600) -> 
     if grid.cell == target.grid.cell:
         grid = snapped(grid, target.grid)
     T_level = pair.target.T_level_work
-    fixed = cut_to(target, grid) or placed(pair.target, T_level, grid)
+    fixed = cut_to(target, grid)
+    if fixed is None and not (pair.source.complete and pair.target.complete):
+        # both alike: of slopes the lowest of a coarse cell lies lower than that of a fine one
+        return warp_bev(source, T, grid), warp_bev(target, np.eye(4), grid)
+    fixed = fixed or placed(pair.target, T_level, grid)
     return placed(pair.source, T_level @ pair.T_target_source, grid), fixed
 
 

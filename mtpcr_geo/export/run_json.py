@@ -98,7 +98,7 @@ The metrics:
   no right pose; null from keypoints
 - ``metrics.null_p``: probability that the best hypothesis of a scene without a right pose is as strong, from
   the tail of the mirrored source's; null where there are too few, and from keypoints
-- ``metrics.prior_given``: whether place or yaw were known beforehand, so that only poses about these were
+- ``metrics.narrow_prior``: whether the place was known so well beforehand that hardly any other pose was
   searched; the probability then counts the margin for no more than the mirrored source's
 - ``metrics.overlap_m2``: ground that both clouds see
 - ``metrics.overlap_source``: the same as a share of the source's ground, 0 to 1

@@ -147,7 +147,11 @@ def placed(name: str | os.PathLike[str], folder: str | os.PathLike[str] = "") ->
     """
     text = os.fspath(name)
     mark = LIST_MARK if text.startswith(LIST_MARK) else ""
-    return Path(f"{mark}{Path(folder, text.removeprefix(mark)).absolute()}")
+    name = text.removeprefix(mark)
+    if not mark and glob.has_magic(name) and not os.path.lexists(Path(folder, name)):
+        # what the folder is called is no part of the pattern
+        return Path(glob.escape(os.path.abspath(folder or os.curdir)), name)
+    return Path(f"{mark}{Path(folder, name).absolute()}")
 
 
 def files_of(path: str | Path, is_cloud: Callable[[Path], bool]) -> list[Path]:

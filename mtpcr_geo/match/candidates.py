@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mtpcr_geo.core.arrays import Mask
+from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.statistics import chance_within, neg_log10_p
 from mtpcr_geo.match.base import LARGEST_MARGIN, margin_of
 from mtpcr_geo.match.patches import PatchMatches
 from mtpcr_geo.match.pose import Pose
+from mtpcr_geo.match.prior import Prior
 from mtpcr_geo.match.search import angle_between
 from mtpcr_geo.match.terrain import GroundComparison
 from mtpcr_geo.method.scales import Scales
@@ -31,6 +33,11 @@ HALF_POWER_TIMES_FEWEST = 5.0
 
 LEAST_BY_ITSELF = 0.5
 """Share of the greatest strength, the ground left out, with which the best hypothesis may end a search."""
+
+
+CLEARLY_BEYOND = 1.3
+"""Times that a pose beyond a prior is stronger than all within it, from which on the prior does not hold: the
+margin that a pose must have over others to be accepted."""
 
 
 @dataclass(frozen=True)
@@ -214,6 +221,28 @@ class GroundWeights:
 
 def _known(candidate: Candidate) -> bool:
     return candidate.ground is not None and candidate.ground.known
+
+
+def held_to(prior: Prior | None, judged: list[Candidate], grid: Grid, slack_m: float) -> list[Candidate]:
+    """Return the candidates that lie within a prior; all where it holds nothing, or is clearly wrong.
+
+    Poses leave its range where they are followed down and combed for. Along rows of trees or panels they come
+    to the next one, which fits as well, and is no rival of what is known to lie elsewhere. Where what lies
+    beyond fits clearly better than all within, it is the prior that is wrong: that is for the verdict to say.
+
+    Args:
+        prior: what is known beforehand.
+        judged: candidates.
+        grid: of the source's raster, about whose centre poses are.
+        slack_m: see `Prior.allows`.
+
+    """
+    if prior is None or not prior.holds:
+        return judged
+    within = [one for one in judged if prior.allows(one.pose, grid, slack_m)]
+    ground = GroundWeights.of(judged)
+    best, most = (max((ground.weighed(one) for one in some), default=0.0) for some in (within, judged))
+    return within if within and CLEARLY_BEYOND * best >= most else judged
 
 
 def same_pose(a: Pose, b: Pose, apart_m: float, radius_m: float) -> bool:

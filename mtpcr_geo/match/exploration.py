@@ -9,7 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from mtpcr_geo.core.types import Bev, Hypothesis
-from mtpcr_geo.match.candidates import Candidate, Pool, same_pose
+from mtpcr_geo.match.candidates import Candidate, Pool, held_to, same_pose
 from mtpcr_geo.match.descent import comb, comb_each, follow
 from mtpcr_geo.match.judge import CLEAR_MARGIN, Judge
 from mtpcr_geo.match.nearby import score_nearby
@@ -296,11 +296,9 @@ class Exploration:
             self.pool = Pool.of(self._among(), self.scales, bound)
 
     def _among(self) -> list[Candidate]:
-        """Return what was judged and lies within the prior, or all where nothing does: combing leads out."""
-        if self.prior is None:
-            return self.judged
-        grid, slack = self.pyramid.source.grid, tolerance_for(self.scales.cell_m)
-        return [one for one in self.judged if self.prior.allows(one.pose, grid, slack)] or self.judged
+        """Return what was judged, as far as the prior holds it."""
+        slack = tolerance_for(self.scales.cell_m)
+        return held_to(self.prior, self.judged, self.pyramid.source.grid, slack)
 
     def _comb_about_the_best(self, known: float) -> None:
         """Judge the best place near the best hypothesis too, where that is another."""

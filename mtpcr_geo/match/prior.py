@@ -32,6 +32,8 @@ class Prior:
         radius_m: how far from there it may lie.
         yaw: by how much the source is turned, radians; None if that is not known.
         yaw_range: how far it may be turned from there, radians.
+        holds: whether what lies beyond is no rival: what was found by a coarser search, and given by nobody,
+            tells where to look, and no more.
 
     """
 
@@ -40,14 +42,15 @@ class Prior:
     radius_m: float = np.inf
     yaw: float | None = None
     yaw_range: float = np.pi
+    holds: bool = True
 
     @classmethod
     def around(
         cls, hypothesis: Hypothesis, pivot: tuple[float, float], radius_m: float, yaw_range: float
     ) -> Prior:
-        """Make a prior of a whole pose: the pivot lies near where that puts it."""
+        """Make a prior of a pose that a coarser search found: the pivot lies near where that puts it."""
         pose = pose_of(hypothesis, np.asarray(pivot))
-        return cls(pivot, (pose.east, pose.north), radius_m, pose.yaw, yaw_range)
+        return cls(pivot, (pose.east, pose.north), radius_m, pose.yaw, yaw_range, holds=False)
 
     def mirrored(self) -> Prior:
         """Return what to search the mirrored source under: the same place, and every yaw.

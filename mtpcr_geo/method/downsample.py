@@ -14,8 +14,6 @@ MAX_VOXELS = 30_000_000
 DENSE_VOXELS = 2.5
 """Mean points a voxel above which voxels give their mean point, and below which all points are taken."""
 
-AXES_POINTS = 2_000_000
-"""Points above which axes are those of every second, third ... one."""
 REGION_VOXELS = 8.0
 """Edge of the blocks of a cloud that are thinned as a whole, in voxels."""
 SHARES = 8
@@ -100,15 +98,14 @@ def own_axes(xyz: Floats) -> Floats:
         4x4 from the points' coordinates to those along their axes.
 
     """
-    some = xyz[:: -(-len(xyz) // AXES_POINTS)]
-    middle = transforms.centroid(some)
+    middle = transforms.centroid(xyz)
     scatter, reach = np.zeros((3, 3)), np.zeros(3)
-    for start in range(0, len(some), _BLOCK):
-        part = some[start : start + _BLOCK] - middle
+    for start in range(0, len(xyz), _BLOCK):
+        part = xyz[start : start + _BLOCK] - middle
         scatter += part.T @ part
     axes = np.linalg.eigh(scatter)[1][:, ::-1].T
-    for start in range(0, len(some), _BLOCK):
-        placed = axes @ (some[start : start + _BLOCK] - middle).T
+    for start in range(0, len(xyz), _BLOCK):
+        placed = axes @ (xyz[start : start + _BLOCK] - middle).T
         reach += np.einsum("ij,ij,ij->i", placed, placed, placed)
     axes[reach < 0.0] *= -1.0
     axes[2] = np.cross(axes[0], axes[1])

@@ -21,7 +21,7 @@ import numpy as np
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import InputError, MtpcrError, OptionError, OutputError, RegistrationError
-from mtpcr_geo.core.paths import link_among, read_whole
+from mtpcr_geo.core.paths import link_among, read_whole, short
 from mtpcr_geo.core.progress import NoProgress, Progress
 from mtpcr_geo.core.wording import in_a_line
 from mtpcr_geo.registration import Registration, register
@@ -29,7 +29,7 @@ from mtpcr_geo.survey import is_survey
 from mtpcr_geo.survey.earlier import remove_earlier
 from mtpcr_geo.survey.engine import SAME_PATHS, engine_of
 from mtpcr_geo.survey.index import write_atomic
-from mtpcr_geo.survey.jobs import Job
+from mtpcr_geo.survey.jobs import Job, folder_name
 from mtpcr_geo.survey.options import BatchOptions
 from mtpcr_geo.survey.register import register_in_survey
 
@@ -130,7 +130,7 @@ def run_batch(
         progress: receives the number of jobs done.
 
     Raises:
-        OptionError: if jobs share a name, upper and lower case taken as one.
+        OptionError: if jobs share a name, upper and lower case taken as one, or a name is none of a folder.
         OutputError: if the folder holds something else, or cannot be written.
         MissingPartError: if more than one worker is wanted and Dask is not installed.
 
@@ -142,6 +142,9 @@ def run_batch(
     again = next((job.name for job in jobs if taken[job.name.casefold()] > 1), None)
     if again is not None:
         raise OptionError(f"{taken[again.casefold()]} jobs are called {again}; give each a name of its own")
+    wrong = next((job.name for job in jobs if folder_name(job.name) != job.name), None)
+    if wrong is not None:
+        raise OptionError(f"no job can be called {short(wrong)}; give letters, digits and any of . + - _")
     foreign = os.path.exists(folder) and not os.path.isfile(folder / MARK)
     if foreign and not options.overwrite and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder} is there already, and is no batch; name another folder, or --overwrite")
@@ -194,13 +197,22 @@ def do(task: _Task) -> Row:
 
 
 def _without_result(task: _Task, row: Row, started: float | None = None) -> Row:
-    """Write the row of a job that left no result, and remove that of an earlier run of another input."""
+    """Write the row of a job that left no result, and remove that of an earlier run of another input.
+
+    What the same input gave earlier stays, and so does all where an input cannot be found now: a drive that
+    is not there is no other input.
+    """
+    job = task.job
     seconds = 0.0 if started is None else round(time.perf_counter() - started, 3)
     row = replace(row, seconds=seconds, folder="")
+    earlier = _read_row(task.folder, job.name)
+    stays = earlier is None or earlier.key == job.key or not job.is_here
     # the row comes first: whatever ends this, the table claims no result that is another's
     _write_row(task.folder, row)
+    if stays:
+        return row
     try:
-        remove_earlier(task.folder / _JOBS / task.job.name, (task.job.source, task.job.target))
+        remove_earlier(task.folder / _JOBS / job.name, job.reads)
     except OutputError as error:
         row = replace(row, reason=f"{row.reason}; and an earlier result stays: {error}")
         _write_row(task.folder, row)
@@ -275,13 +287,19 @@ def _write_row(folder: Path, row: Row) -> None:
 
 def _row_of(folder: Path, job: Job) -> Row | None:
     """Return the row of a job; None where there is none that can be read, or it is of another input."""
+    row = _read_row(folder, job.name)
+    return row if row is not None and row.key == job.key and _is_placed(row) else None
+
+
+def _read_row(folder: Path, name: str) -> Row | None:
+    """Return the row that an earlier run wrote under a name; None where there is none that can be read."""
     from pydantic import TypeAdapter, ValidationError
 
     try:
-        row = TypeAdapter(Row).validate_json(read_whole(_row_path(folder, job.name)))
+        row = TypeAdapter(Row).validate_json(read_whole(_row_path(folder, name)))
     except (OSError, ValidationError, InputError):
         return None
-    return row if (row.name, row.key) == (job.name, job.key) and _is_placed(row) else None
+    return row if row.name == name else None
 
 
 def _is_placed(row: Row) -> bool:

@@ -57,6 +57,16 @@ class Job:
             about[name] = [_state(one) for one in _at(path)]
         return sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()
 
+    @property
+    def reads(self) -> tuple[Path, ...]:
+        """All files and folders that the job reads, as it names them."""
+        return (self.source, self.target, *_paths_in(self.options).values())
+
+    @property
+    def is_here(self) -> bool:
+        """Whether all that the job reads is found."""
+        return all(state[1] >= 0 for path in self.reads for state in _states(path))
+
     def placed(self, folder: str | os.PathLike[str] = "") -> Job:
         """Return the job with all paths absolute, so that any process on any machine reads the same by them.
 
@@ -126,7 +136,7 @@ def _of_table(path: Path, target: Path | None, common: Mapping[str, Any]) -> lis
             raise OptionError(f"{where}: {error}") from None
         # what the table says is relative to it, what the command line says to where it is given
         here = {key: str(placed(one)) for key, one in _paths_in(given).items() if key not in options}
-        name = _name(values.get("name") or Path(values["source"]).stem)
+        name = folder_name(values.get("name") or Path(values["source"]).stem)
         if name.lower() in taken:
             raise InputError(f"{where}: there is a job {name} already; add a column name")
         taken.add(name.lower())
@@ -157,11 +167,10 @@ def _value(name: str, text: str) -> Any:
 def _named(sources: Sequence[Path]) -> list[tuple[str, Path]]:
     """Return each source with a name that no other has, upper and lower case taken as one.
 
-    Of names that would be the same each gets a suffix that follows from the path alone: it stays when sources
-    come and go beside it.
+    Of names that would be the same each gets a suffix that follows from the path alone.
     """
     each = list({os.path.abspath(source): source for source in sources}.items())
-    names = [_name(source.stem) for _, source in each]
+    names = [folder_name(source.stem) for _, source in each]
     often = Counter(name.casefold() for name in names)
     return [
         (
@@ -172,7 +181,7 @@ def _named(sources: Sequence[Path]) -> list[tuple[str, Path]]:
     ]
 
 
-def _name(text: str) -> str:
+def folder_name(text: str) -> str:
     """Return a name that a folder may have."""
     return re.sub(r"[^\w.+-]+", "_", text).strip(".") or "job"
 
@@ -194,7 +203,7 @@ def _at(path: Path) -> list[Path]:
 def _states(path: Path) -> list[tuple[str, int, int]]:
     try:
         files = files_at(path)
-    except InputError:
+    except (OSError, InputError):
         files = [path]
     return [_state(one) for one in files]
 

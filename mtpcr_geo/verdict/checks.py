@@ -92,9 +92,11 @@ def _margin(evidence: Evidence, limits: Limits) -> Check:
     if evidence.margin is None:
         return Check("next distinct pose", "not known", f"{limits.margin:g} times", None, meaning)
     value, wanted = beside(evidence.margin, limits.margin, 2)
-    if evidence.prior_given:
-        meaning += " Only poses about what was known beforehand were searched: the probability counts it for "
-        meaning += "no more than the mirrored source's."
+    if evidence.narrow_prior:
+        meaning += (
+            " The place was known beforehand, and hardly any other pose searched: the probability counts "
+        )
+        meaning += "it for no more than the mirrored source's."
     value = "no other" if evidence.margin >= LARGEST_MARGIN else f"{value} times"
     return Check("next distinct pose", value, f"at least {wanted} times", True, meaning)
 

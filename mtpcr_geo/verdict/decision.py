@@ -107,7 +107,7 @@ def metrics_of(evidence: Evidence) -> dict[str, Any]:
         "hypothesis_margin": evidence.margin,
         "patch_support": evidence.support,
         "null_ratio": evidence.null_ratio,
-        "prior_given": evidence.prior_given,
+        "narrow_prior": evidence.narrow_prior,
         "null_p": evidence.null_p,
         "overlap_m2": evidence.overlap_m2,
         "overlap_source": evidence.overlap_source,

@@ -28,6 +28,9 @@ from mtpcr_geo.verdict.null import null_probability
 GROUND_AGREES_M = 0.5
 UNBOUNDED_CELLS = 2.0
 MOST_CHANCE = 0.5
+FEW_PLACES = 3.0
+"""Radius within which the place is known, in distances from which on poses are distinct, below which the next
+distinct pose is one of a few, weak by chance or missing."""
 FAR_TOLERANCES, FAR_TURN_DEG = 5.0, 5.0
 """Tolerances in plan, or turn, from which on another pose is another place and not the same a little off."""
 
@@ -94,7 +97,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         final_agreeing=int((residual < tolerance).sum()),
         missing=_missing(pair),
         rivals=rivals_of(pair, tolerance),
-        prior_given=pair.known is not None,
+        narrow_prior=_narrow_prior(pair),
         mapped=pair.frame.crs is not None,
         not_levelled=tuple(
             f"the {side.role} was not levelled: {side.levelling.why or 'nothing tells its vertical'}"
@@ -120,6 +123,16 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         **further,
     }
     return evidence, more
+
+
+def _narrow_prior(pair: Pair) -> bool:
+    """Return whether the place was known so well beforehand that hardly any other pose was searched."""
+    known, matches = pair.known, pair.matches
+    if known is None or known.within_m is None or matches is None or matches.null_ratio is None:
+        return False
+    if pair.source.bev is None or pair.target.bev is None:
+        return False
+    return known.within_m < FEW_PLACES * scales_of(pair.source.bev, pair.target.bev).same_pose_m
 
 
 def _in_work_frame(uncertainty: Uncertainty, pair: Pair) -> Uncertainty:

@@ -59,7 +59,7 @@ def against_others(evidence: Evidence) -> list[str]:
     """Say how far the pose stands above the next distinct one and the mirrored source."""
     found = []
     if evidence.margin is not None:
-        where = " about what was known beforehand" if evidence.prior_given else ""
+        where = " about what was known beforehand" if evidence.narrow_prior else ""
         found.append(
             f"no other distinct pose was found{where}"
             if evidence.margin >= LARGEST_MARGIN
@@ -179,7 +179,7 @@ def margin_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
     else:
         text = f"{what} fits nearly as well (margin {value}, wanted {wanted})"
     advice = "give larger parts of the clouds"
-    advice += ", or say more exactly" if evidence.prior_given else ", or say roughly"
+    advice += ", or say more exactly" if evidence.narrow_prior else ", or say roughly"
     return CheckFinding(f"{text}; {_REPEATS_ITSELF}: {advice} {_WHERE}", refuses=margin < 1.0)
 
 

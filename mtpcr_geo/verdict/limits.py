@@ -54,7 +54,7 @@ class Evidence:
         sliding: the motion in plan that the fit tells least; None where that is not known.
         drift: how what is left bends along the overlap; None where that is not known.
         contradictions: what was known beforehand and is not so, a sentence each.
-        prior_given: whether place or yaw were known beforehand, so that only poses about these were searched.
+        narrow_prior: whether the place was known so well beforehand that hardly any other pose was searched.
 
     """
 
@@ -92,7 +92,7 @@ class Evidence:
     objects_missing: float | None = None
     sliding: Sliding | None = None
     drift: Drift | None = None
-    prior_given: bool = False
+    narrow_prior: bool = False
 
 
 @dataclass(frozen=True)

@@ -89,8 +89,9 @@ def departure(pair: Pair) -> tuple[dict[str, Any], tuple[str, ...]]:
     metrics: dict[str, Any] = {}
     contradictions = []
     slack = tolerance_for(pair.cell)
+    R_level = pair.target.T_level_work[:3, :3]
     if known.place is not None and known.within_m is not None:
-        gap = transforms.apply(T, known.middle[None])[0] - known.place
+        gap = R_level @ (transforms.apply(T, known.middle[None])[0] - known.place)
         distance = metrics["prior_distance_m"] = float(np.hypot(gap[0], gap[1]))
         if distance > known.within_m + slack:
             where = _NAMES.get(known.given_by, "the place given puts")
@@ -100,6 +101,9 @@ def departure(pair: Pair) -> tuple[dict[str, Any], tuple[str, ...]]:
             )
     if known.yaw is not None and known.yaw_within is not None:
         turn = transforms.yaw_of(T[:3, :3]) - known.yaw
+        if known.T is not None:
+            turned, prior = pair.levelled(T), pair.levelled(known.T)
+            turn = transforms.yaw_of(turned[:3, :3]) - transforms.yaw_of(prior[:3, :3])
         angle = abs(float(np.arctan2(np.sin(turn), np.cos(turn))))
         metrics["prior_yaw_difference_deg"] = float(np.degrees(angle))
         arm = float(np.sqrt(((pair.source.sample - known.middle)[:, :2] ** 2).sum(axis=1).mean()))

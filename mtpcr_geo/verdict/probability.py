@@ -90,7 +90,7 @@ def features_of(metrics: Mapping[str, Any]) -> Floats | None:
     significance = metrics.get("neg_log10_p")
     if margin is None or null is None or significance is None:
         return None
-    if metrics.get("prior_given"):
+    if metrics.get("narrow_prior"):
         # among the few poses about a prior the next one may be weak by chance, or there is none
         margin = min(margin, null)
     spread, relief = metrics.get("ground_spread_m"), metrics.get("ground_relief_m")

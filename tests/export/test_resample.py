@@ -108,3 +108,17 @@ def test_a_grid_is_snapped_outwards():
     assert found.west + found.width * 2.0 >= 21.0
     assert found.north - found.height * 2.0 <= 37.5
     assert resample.cut_to(make_bev(np.zeros((1, 3)), 2.0), found) is not None
+
+
+def test_slopes_of_a_cloud_that_is_held_and_one_that_is_not_lie_alike():
+    rng = np.random.default_rng(4)
+    xy = rng.uniform(0.0, 120.0, (120_000, 2))
+    slope = np.column_stack([xy, 0.2 * xy[:, 0]])
+    bev = make_bev(slope, 1.0)
+    pair = turned_by_nothing((0.0, 0.0, 0.0))
+    target = replace(pair.target, sample=slope, bev=bev, complete=False)
+    pair = pair.with_(target=target, source=replace(target, role="source", complete=True))
+    source, fixed = drawing.common_rasters(pair, max_side=50)
+    assert source.grid.cell > 2.0
+    assert abs(np.nanmedian(source.low - fixed.low)) < 0.02
+    assert abs(np.nanmedian(source.top - fixed.top)) < 0.02

@@ -22,7 +22,7 @@ from mtpcr_geo.core.errors import CrsError, InputError
 from mtpcr_geo.export.apply import write_moved
 from mtpcr_geo.io.formats import open_any
 from mtpcr_geo.io.las import open_cloud
-from mtpcr_geo.io.many import ManyFiles, output_names, uncommon_of
+from mtpcr_geo.io.many import ManyFiles, files_of, output_names, placed, uncommon_of
 from mtpcr_geo.io.sample import scan
 from mtpcr_geo.io.views import Moved
 from mtpcr_geo.io.write import write_cloud
@@ -309,3 +309,19 @@ def test_check_and_the_command_take_them(clouds, tmp_path):
     found = CliRunner().invoke(app, ["register", *files, "-o", str(tmp_path / "out")])
     assert found.exit_code == 2
     assert "a pattern in quotes" in found.output
+
+
+def test_what_a_folder_is_called_is_no_part_of_a_pattern(tmp_path, monkeypatch):
+    folder = tmp_path / "p [1] q"
+    (folder / "scans").mkdir(parents=True)
+    for name in ("a.xyz", "b.xyz"):
+        (folder / "scans" / name).write_text("1 2 3\n4 5 6\n")
+    monkeypatch.chdir(folder)
+    found = files_of(placed("scans/*.xyz"), lambda path: True)
+    assert [path.name for path in found] == ["a.xyz", "b.xyz"]
+    monkeypatch.chdir(tmp_path)
+    found = files_of(placed("scans/*.xyz", folder), lambda path: True)
+    assert [path.name for path in found] == ["a.xyz", "b.xyz"]
+    # a file whose name looks like a pattern is that file
+    (folder / "x[1].xyz").write_text("1 2 3\n")
+    assert placed("x[1].xyz", folder) == folder / "x[1].xyz"

@@ -97,3 +97,12 @@ def test_a_missing_coordinate_is_refused_with_its_line(row, axis, tmp_path):
 
 def test_a_coordinate_that_is_stated_to_be_none_is_read(tmp_path):
     assert np.isnan(xyz_of(tmp_path / "a.csv", "x,y,z\n1,2,3\nnan,2,3\n")).sum() == 1
+
+
+@pytest.mark.parametrize("head", ["x,y,z,intensity,\n", ""])
+def test_a_separator_behind_the_last_column_is_none(tmp_path: Path, head: str) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(head + "1.5,2.5,3.5,10,\n2.5,3.5,4.5,20,\n")
+    table = next(open_any(path).table_chunks())
+    assert list(table["X"]) == [1.5, 2.5]
+    assert len(table) == 4

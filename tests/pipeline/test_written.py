@@ -9,6 +9,8 @@ import re
 from html import unescape
 from pathlib import Path
 
+import laspy
+import numpy as np
 import pytest
 from helpers_scene import make_pair
 from rich.console import Console
@@ -151,3 +153,18 @@ def test_applying_a_transform_that_was_not_accepted_warns(tmp_path):
         "ambiguous": "the verdict on this transform is doubtful and its files were forced: margin",
         "refused": "the verdict on this transform is refused and its files were forced: no",
     }
+
+
+def test_a_scale_is_metres_where_the_registered_cloud_has_degrees(
+    town_files: tuple[Path, Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    register(
+        *town_files, out, out_crs="EPSG:4326+7837", target_crs="EPSG:25833+7837",
+        source_crs="EPSG:25833+7837", scale=0.001, recording=False,
+    )  # fmt: skip
+    with laspy.open(out / "registered.laz") as file:
+        assert list(file.header.scales) == pytest.approx([1e-8, 1e-8, 1e-3])
+        plan = np.asarray(file.read().xyz)[:, :2]
+    # of some 120 m, in steps of a millimetre
+    assert min(len(np.unique(values)) for values in plan.T) > 1000

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers_survey import town_source, town_target, write_tile
 
+from mtpcr_geo.core.errors import OptionError
 from mtpcr_geo.survey.batch import Row, run_batch
 from mtpcr_geo.survey.build import build_survey
 from mtpcr_geo.survey.engine import Engine
@@ -58,9 +59,34 @@ def test_a_failed_job_leaves_no_result_of_another_input(copied: Path) -> None:
 
 
 def test_where_nothing_else_lies_the_folder_goes_too(copied: Path) -> None:
-    row = one_job(copied, copied / "none.laz")
+    (copied / "broken.laz").write_bytes((copied / "target.laz").read_bytes()[:5000])
+    row = one_job(copied, copied / "broken.laz")
     assert (row.verdict, row.folder) == ("failed", "")
     assert not (copied / "batch" / "jobs" / "scan").exists()
+
+
+def test_what_a_drive_holds_that_is_not_there_costs_no_result(copied: Path) -> None:
+    before = files_below(copied / "batch" / "jobs" / "scan")
+    (copied / "scans").rename(copied / "elsewhere")
+    row = one_job(copied, copied / "scans")
+    assert (row.verdict, row.folder) == ("failed", "")
+    assert files_below(copied / "batch" / "jobs" / "scan") == before
+    (copied / "elsewhere").rename(copied / "scans")
+    assert one_job(copied, copied / "scans").verdict == "accepted"
+
+
+def test_a_prior_in_the_folder_of_the_job_is_not_removed(copied: Path) -> None:
+    prior = copied / "batch" / "jobs" / "scan" / "transform.json"
+    row = one_job(copied, copied / "scans", prior=str(prior))
+    assert row.verdict == "failed"
+    assert prior.is_file()
+
+
+@pytest.mark.parametrize("name", ["../scan", "/scan", "a b", ""])
+def test_a_job_is_called_as_a_folder_may_be(tmp_path: Path, name: str) -> None:
+    job = Job(name, tmp_path / "s.laz", tmp_path / "t.laz", {})
+    with pytest.raises(OptionError, match="can be called"):
+        run_batch([job], tmp_path / "batch", HERE)
 
 
 def test_a_job_that_a_survey_has_no_place_for_leaves_none_either(copied: Path) -> None:
@@ -75,7 +101,8 @@ def test_a_job_that_a_survey_has_no_place_for_leaves_none_either(copied: Path) -
 
 def test_what_a_job_reads_is_never_removed(copied: Path) -> None:
     own = copied / "batch" / "jobs" / "scan" / "registered" / "scan0.laz"
-    row = one_job(copied, own, copied / "none.laz")
+    (copied / "broken.laz").write_bytes((copied / "target.laz").read_bytes()[:5000])
+    row = one_job(copied, own, copied / "broken.laz")
     assert row.verdict == "failed"
     assert own.is_file()
     assert not (own.parent / "scan1.laz").exists()

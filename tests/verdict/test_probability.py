@@ -99,18 +99,18 @@ def test_about_a_prior_a_next_pose_that_is_weak_or_missing_proves_nothing() -> N
         "margin": 11.0, "null_ratio": 2.99, "held_out": 17, "held_out_agreeing": 6, "ground_cells": 60,
         "ground_agreeing": 60, "ground_spread_m": None, "ground_relief_m": None,
     }  # fmt: skip
-    assert probability(**unrelated, prior_given=True) < probability(**unrelated)
-    assert probability(**{**unrelated, "margin": LARGEST_MARGIN}, prior_given=True) == pytest.approx(
-        probability(**{**unrelated, "margin": 2.99}, prior_given=True)
+    assert probability(**unrelated, narrow_prior=True) < probability(**unrelated)
+    assert probability(**{**unrelated, "margin": LARGEST_MARGIN}, narrow_prior=True) == pytest.approx(
+        probability(**{**unrelated, "margin": 2.99}, narrow_prior=True)
     )
     # a rival counts as ever
-    assert probability(margin=1.2, prior_given=True) == probability(margin=1.2)
-    alone = assess(replace(CLEAR, margin=LARGEST_MARGIN, prior_given=True), Limits())
+    assert probability(margin=1.2, narrow_prior=True) == probability(margin=1.2)
+    alone = assess(replace(CLEAR, margin=LARGEST_MARGIN, narrow_prior=True), Limits())
     assert alone.name == "accepted"
     assert any(reason.startswith("no other distinct pose was found") for reason in alone.reasons)
     (check,) = (one for one in alone.checks if one.name == "next distinct pose")
     assert (check.value, check.passed) == ("no other", True)
-    rivalled = assess(replace(CLEAR, margin=1.1, prior_given=True), Limits())
+    rivalled = assess(replace(CLEAR, margin=1.1, narrow_prior=True), Limits())
     assert any("say more exactly where the source lies" in reason for reason in rivalled.reasons)
 
 

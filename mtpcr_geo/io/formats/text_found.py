@@ -111,7 +111,8 @@ def _is_between(sign: str, rows: Sequence[str], title: str, decimal: str) -> boo
     ):
         return False
     # some programs put one behind the last column too
-    return any(one[-1] for one in fields) or len(title.split(sign)) == count
+    names = title.split(sign)
+    return any(one[-1] for one in fields) or (len(names) == count and bool(names[-1].strip()))
 
 
 def empty_place(

@@ -43,19 +43,22 @@ def with_points_near(pair: Pair, context: RunContext) -> Pair:
     """
     if pair.T_target_source is None:
         return pair
-    T = pair.T_target_source
-    target = _denser(pair.target, pair.source, T, pair.cell, context)
-    source = _denser(pair.source, pair.target, transforms.inverse(T), pair.cell, context)
+    # what is found is held against what was known beforehand
+    poses = [T for T in (pair.T_target_source, pair.T_prior) if T is not None]
+    back = [transforms.inverse(T) for T in poses]
+    target = _denser(pair.target, pair.source, poses, pair.cell, context)
+    source = _denser(pair.source, pair.target, back, pair.cell, context)
     if target is pair.target and source is pair.source:
         return pair
     return pair.with_(target=target, source=source)
 
 
-def _denser(side: Side, other: Side, T: Floats, cell: float, context: RunContext) -> Side:
-    """Return a side with the points about the other one, which a 4x4 brings to its work coordinates."""
+def _denser(side: Side, other: Side, poses: list[Floats], cell: float, context: RunContext) -> Side:
+    """Return a side with the points about the other one, which each 4x4 brings to its work coordinates."""
     if side.complete or side.near is not None:
         return side
-    box = np.stack(transforms.bounds(transforms.apply(T, other.sample)))
+    boxes = np.array([transforms.bounds(transforms.apply(T, other.sample)) for T in poses])
+    box = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
     margin = MARGIN_CELLS * cell + MARGIN_SHARE * np.ptp(box, axis=0).max()
     box = box + [[-margin], [margin]]
     if np.array_equal(side.T_level_work, np.eye(4)):

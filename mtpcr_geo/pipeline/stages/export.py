@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from mtpcr_geo.core.errors import OptionError
+from mtpcr_geo.core.errors import OptionError, RegistrationError
 from mtpcr_geo.core.recorder import LEAST_RECORDING_MB, RECORDING_MB, NullRecorder
 from mtpcr_geo.core.system import command_line, peak_memory_mb, usable_cores
 from mtpcr_geo.core.types import Pair, Side, Verdict
@@ -174,9 +174,16 @@ class WriteBev(EvidenceWriter):
         from mtpcr_geo.export.resample import registered_bev
 
         registered, difference_file, upright_file = (self._file(role) for role in DERIVED_ROLES)
-        upright = upright_target(pair)
+        try:
+            upright, moved = upright_target(pair), registered_bev(pair)
+        except RegistrationError as error:
+            # a strip that is turned may span more cells than fit: that is no fault of the transform
+            files = (registered, difference_file)
+            self.not_written |= dict.fromkeys(
+                [*files, *(one.with_suffix(".qml") for one in files)], str(error)
+            )
+            return
         z = float(pair.frame.origin[2])
-        moved = registered_bev(pair)
         low, high = height_limits([upright.top, moved.top])
         write_registered_bev(context.outputs.path(registered), pair, moved)
         self._style(context, registered, relief_style(low + z, high + z))

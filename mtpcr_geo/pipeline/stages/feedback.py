@@ -18,12 +18,14 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats
 from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.types import Bev, Levelling, Pair, Refinement, Side
+from mtpcr_geo.match.registry import CorrelationMatcher
 from mtpcr_geo.method.icp import Surfaces, rounds_for
 from mtpcr_geo.method.inverse_mapping import tie_points_of
 from mtpcr_geo.method.refine import FEW_TIE_POINTS, RefineSettings, refine, target_moves
 from mtpcr_geo.method.scales import tolerance_for
 from mtpcr_geo.method.solve import solve_tie_points
 from mtpcr_geo.method.upright import points_near, seen_upright
+from mtpcr_geo.pipeline.stages.priors import prior_of
 from mtpcr_geo.pipeline.stages.views import shown, view_of
 from mtpcr_geo.verdict.evidence import middle_of_tie_points, moved_in_plan, tie_points_agreeing
 
@@ -337,6 +339,9 @@ def _solved(again: Pair, before: Pair) -> Pair:
     assert first is not None
     assert solution is not None
     matcher = first.matcher
+    if again.known is not None and isinstance(matcher, CorrelationMatcher):
+        # place and yaw known beforehand are others between clouds levelled otherwise
+        matcher = replace(matcher, prior=prior_of(again.known, again))
     if matcher.needs_image:
         again = again.with_(source=shown(again.source), target=shown(again.target))
     views = [view_of(side, matcher.needs_image) for side in (again.source, again.target)]

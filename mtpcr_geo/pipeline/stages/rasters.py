@@ -302,7 +302,8 @@ def with_rasters(
 
 
 def _coverage(side: Side) -> Coverage:
-    return coverage_of(side.levelled_sample, points=side.cloud.count - side.no_returns - side.strays)
+    points = None if side.complete else side.cloud.count - side.no_returns - side.strays
+    return coverage_of(side.levelled_sample, points=points)
 
 
 def rasterised(side: Side, cell: float, convention: Convention, context: RunContext) -> Bev:

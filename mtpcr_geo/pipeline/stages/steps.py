@@ -325,9 +325,12 @@ def _cloud_writers(
 ) -> Iterator[Stage]:
     """Yield the stages that write the registered cloud: as LAZ, and in the format asked for."""
     if not parts:
-        scales = {f"scale_{axis}": scale for axis in "xyz"}
         whole = folder / OUTPUT_NAMES["registered"]
-        yield LasWriter(LasWriterOptions(filename=whole, **scales), "registered")
+        if scale is None:
+            yield LasWriter(LasWriterOptions(filename=whole), "registered")
+        else:
+            # its one number is metres where the CRS has degrees, and those of writers.las are degrees then
+            yield FileWriter(FileWriterOptions(filename=whole, scale=scale), "registered")
         if also is not None:
             options = FileWriterOptions(filename=whole.with_suffix(f".{also}"), scale=scale)
             yield FileWriter(options, "registered_also")
