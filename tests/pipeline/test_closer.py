@@ -11,7 +11,6 @@ from helpers_scene import ORIGIN, TOWN_TURNED
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.types import Pair
-from mtpcr_geo.io.las import LasCloud
 from mtpcr_geo.pipeline.api import Pipeline
 
 
@@ -47,18 +46,11 @@ def off_m(pair: Pair, source: Path) -> float:
     return float(np.linalg.norm(placed - transforms.apply(transforms.inverse(about), corners), axis=1).max())
 
 
-def test_what_is_refined_and_judged_does_not_thin_out_with_the_cloud(town_files, monkeypatch):
+def test_what_is_refined_and_judged_does_not_thin_out_with_the_cloud(town_files, decoded):
     whole = registered(town_files, 4_000_000)
     assert whole.target.near is None
     assert whole.source.near is None
-    decoded: list[str] = []
-    decode = LasCloud.record_chunks
-
-    def counting(cloud, *args, **more):
-        decoded.append(cloud.name)
-        return decode(cloud, *args, **more)
-
-    monkeypatch.setattr(LasCloud, "record_chunks", counting)
+    decoded.clear()
     sampled = registered(town_files, 4000)
     # the coordinates were kept by the first pass: nothing is decoded again
     assert sorted(decoded) == sorted(str(file) for file in town_files)

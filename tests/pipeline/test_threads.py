@@ -13,7 +13,6 @@ import laspy
 import numpy as np
 import pytest
 
-from mtpcr_geo.io.las import LasCloud
 from mtpcr_geo.pipeline.api import Pipeline
 
 
@@ -44,15 +43,7 @@ def test_same_bits_at_any_number_of_threads(town_files, tmp_path):
     assert np.array_equal(laspy.read(cloud_one).points.array, laspy.read(cloud_two).points.array)
 
 
-def test_a_raster_from_kept_points_is_that_of_the_points_in_memory(town_files, monkeypatch):
-    decoded: list[str] = []
-    decode = LasCloud.record_chunks
-
-    def counting(cloud, *args, **more):
-        decoded.append(cloud.name)
-        return decode(cloud, *args, **more)
-
-    monkeypatch.setattr(LasCloud, "record_chunks", counting)
+def test_a_raster_from_kept_points_is_that_of_the_points_in_memory(town_files, decoded):
     rasters = {}
     for budget in (4_000_000, 20_000):
         decoded.clear()
