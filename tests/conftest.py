@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers_paths import REPOSITORY
 from hypothesis import HealthCheck, settings
 from numpy.typing import NDArray
 from pyproj import CRS
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.cloud import ArrayCloud
+from mtpcr_geo.io.las import LasCloud
 from mtpcr_geo.io.write import write_cloud
-
-REPOSITORY = Path(__file__).resolve().parent.parent
 
 # No deadlines, and no health check that goes by the clock: how long an example takes depends on what else the
 # machine does. The same examples in every run, so that a failure can be repeated; new ones are looked for
@@ -91,3 +91,17 @@ def town_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
         write_cloud(folder / f"{name}.laz", cloud, None, cloud.crs)
         files.append(folder / f"{name}.laz")
     return files[0], files[1]
+
+
+@pytest.fixture
+def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the LAS files that are decoded from now on, once each time."""
+    names: list[str] = []
+    decode = LasCloud.record_chunks
+
+    def counting(cloud, *args, **more):
+        names.append(cloud.name)
+        return decode(cloud, *args, **more)
+
+    monkeypatch.setattr(LasCloud, "record_chunks", counting)
+    return names

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import grimp
 import pytest
-from conftest import REPOSITORY
+from helpers_paths import REPOSITORY
 
 PACKAGE = "mtpcr_geo"
 MAX_LINES = 450

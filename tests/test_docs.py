@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import REPOSITORY
+from helpers_paths import REPOSITORY
 from markdown_it import MarkdownIt
 from markdown_it.token import Token
 

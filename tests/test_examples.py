@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from helpers_paths import REPOSITORY
 
 from mtpcr_geo.core import transforms
 

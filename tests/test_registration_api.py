@@ -10,7 +10,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from helpers_paths import REPOSITORY
 from helpers_scene import ORIGIN, TOWN_TURNED, make_pair
 from typer.testing import CliRunner
 

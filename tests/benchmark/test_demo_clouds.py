@@ -5,7 +5,7 @@ import json
 import laspy
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from helpers_paths import REPOSITORY
 from scipy.spatial import cKDTree
 
 from mtpcr_geo.benchmark.demo_clouds import AERIAL, GROUND, TRUTH, write_demo

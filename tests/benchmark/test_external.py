@@ -13,7 +13,7 @@ from pathlib import Path
 import helpers_programs as programs
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from helpers_paths import REPOSITORY
 
 from mtpcr_geo.benchmark import methods
 from mtpcr_geo.benchmark.baselines import external, normals, process

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from helpers_paths import REPOSITORY
 
 from mtpcr_geo.benchmark.pairs import write_laz
 from mtpcr_geo.benchmark.sim_to_real import cloud_figures, compare, margins

@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from helpers_paths import REPOSITORY
 
 from mtpcr_geo.benchmark.train import samples
 from mtpcr_geo.benchmark.train.curve import Curve, learning_rate

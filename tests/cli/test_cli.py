@@ -316,7 +316,7 @@ def test_errors_show_no_control_characters(tmp_path):
 
 
 def test_schema_is_a_schema_that_ready_pipelines_fit():
-    from conftest import REPOSITORY
+    from helpers_paths import REPOSITORY
 
     from mtpcr_geo.pipeline.grammar import parse
 

@@ -6,8 +6,8 @@ import re
 from typing import Any, Literal, get_args, get_origin
 
 import pytest
-from conftest import REPOSITORY
 from helpers_las import write_raw
+from helpers_paths import REPOSITORY
 from typer.testing import CliRunner
 
 import mtpcr_geo as mg

@@ -7,7 +7,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from helpers_paths import REPOSITORY
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray

@@ -455,7 +455,7 @@ def test_paper_profile_and_its_switches_in_the_pipeline():
 
 
 def test_ready_pipeline_of_the_paper_is_that_of_the_profile():
-    from conftest import REPOSITORY
+    from helpers_paths import REPOSITORY
 
     from mtpcr_geo.pipeline import grammar
     from mtpcr_geo.pipeline.registry import stage_types

@@ -11,7 +11,7 @@ from typing import Any
 import laspy
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from helpers_paths import REPOSITORY
 from pyproj import CRS
 
 import mtpcr_geo

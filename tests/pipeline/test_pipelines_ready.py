@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from helpers_paths import REPOSITORY
 from typer.testing import CliRunner
 
 import mtpcr_geo
