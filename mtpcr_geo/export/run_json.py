@@ -143,6 +143,8 @@ The metrics:
 - ``metrics.held_out_expected``: held-out tie points that chance would make agree; null from keypoints
 - ``metrics.solid_cells``: cells inside roofs of one cloud that the other fills
 - ``metrics.free_space_conflicts``: of these, cells in which the other sees the ground
+- ``metrics.heights_elsewhere``: how many times as many heights both clouds would fill in the same columns,
+  were the source raised or lowered; null where they share too few columns
 - ``metrics.objects_missing``: share of what stands higher than 2.5 m in one cloud at whose place the other
   sees bare ground only, in the direction in which it is less; null where too little stands in the overlap
 - ``metrics.sigma_plan_m``: standard deviation of the middle of the overlap in plan, along its weakest
@@ -316,6 +318,8 @@ A stage's own figures (``stages[].metadata``), by its type; stages that PDAL ser
 - ``mtpcr.refine <fit>.ground_spread_m``: robust spread of the height differences
 - ``mtpcr.refine <fit>.tilt_deg``: by how much it was tilted
 - ``mtpcr.refine <fit>.followed``: whether the fit was taken over
+- ``mtpcr.refine raised``: whether the source was raised or lowered to where far more of both clouds meets
+  than where their lowest points, by the tie points or the ground, had led
 - ``mtpcr.refine icp.method``: variant of ICP
 - ``mtpcr.refine icp.voxel_m``: thinning of the points
 - ``mtpcr.refine icp.points_source``: points kept of the source

@@ -37,7 +37,8 @@ def checks_of(
 
     """
     makers: tuple[Callable[[Evidence, Limits], Check], ...] = (
-        _margin, _mirrored, _tie_points, _refinement, _ground_heights, _ground_shape, _objects, _shared,
+        _margin, _mirrored, _tie_points, _refinement, _ground_heights, _ground_shape, _objects,
+        _heights, _shared,
     )  # fmt: skip
     checks = [_probability(evidence, limits, probability), *(make(evidence, limits) for make in makers)]
     decided = [
@@ -199,6 +200,20 @@ def _objects(evidence: Evidence, limits: Limits) -> Check:
         return Check("objects", "too few", f"at most {limits.objects_missing:.0%} missing", None, meaning)
     value, wanted = percent(share, limits.objects_missing)
     return Check("objects", f"{value} missing", f"at most {wanted}", True, meaning)
+
+
+def _heights(evidence: Evidence, limits: Limits) -> Check:
+    meaning = (
+        "heights at which both clouds have points in the same columns, were the source raised or lowered, "
+        "over those at which they have as it lies: walls, crowns and roofs of one place meet at one height "
+        "only."
+    )
+    wanted = f"at most {limits.heights_elsewhere:g} times as many elsewhere"
+    if evidence.heights_elsewhere is None:
+        return Check("common heights", "too few columns", wanted, None, meaning)
+    times, rise = evidence.heights_elsewhere
+    value, _ = beside(times, limits.heights_elsewhere, 2)
+    return Check("common heights", f"{value} times as many {rise:+.1f} m from here", wanted, True, meaning)
 
 
 def _warnings(evidence: Evidence) -> tuple[Check, ...]:

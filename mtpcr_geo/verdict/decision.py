@@ -24,6 +24,7 @@ from mtpcr_geo.verdict.findings import (
     ground_checked,
     ground_finding,
     ground_shape_finding,
+    heights_finding,
     held_out_finding,
     margin_finding,
     neg_log10_p_of,
@@ -71,6 +72,7 @@ def assess(evidence: Evidence, limits: Limits, more: dict[str, Any] | None = Non
         "ground heights": [ground_finding(evidence, limits)],
         "ground shape": [ground_shape_finding(evidence, limits), terrain_of_rows_finding(evidence, limits)],
         "objects": [objects_finding(evidence, limits)],
+        "common heights": [heights_finding(evidence, limits)],
         "shared ground": [overlap_finding(evidence, limits)],
     }
     judged_so = {name: [found for found in some if found is not None] for name, some in judgements.items()}
@@ -121,6 +123,7 @@ def metrics_of(evidence: Evidence) -> dict[str, Any]:
         "repeats": evidence.repeats,
         "self_likeness": evidence.self_likeness,
         "objects_missing": evidence.objects_missing,
+        "heights_elsewhere": None if evidence.heights_elsewhere is None else evidence.heights_elsewhere[0],
         "refined_away_m": evidence.refined_away_m,
         "refinement_lost": evidence.refinement_lost,
     }

@@ -15,6 +15,7 @@ from mtpcr_geo.core.types import Hypothesis, Matches, Pair, Rival, SolveSettings
 from mtpcr_geo.core.uncertainty import Uncertainty
 from mtpcr_geo.crs.chain import TransformChain
 from mtpcr_geo.match.base import margin_of
+from mtpcr_geo.method.common_heights import COLUMN_CELLS, common_heights
 from mtpcr_geo.method.overlap import overlap_of
 from mtpcr_geo.method.scales import MAX_LEAST_OVERLAP_M2, ground_cell_for, scales_of, tolerance_for
 from mtpcr_geo.method.shortcomings import what_is_missing
@@ -70,6 +71,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
     whole = moved if pair.source.near is None else transforms.apply(seen.T_target_source, pair.source.sample)
     ground = overlap.common_ground()
     shape = ground.shape()
+    common = common_heights(moved, points_near(seen.target), COLUMN_CELLS * cell, tolerance_for(cell))
     icp = pair.refinement.icp if pair.refinement is not None else None
     evidence = Evidence(
         held_out=len(held_out),
@@ -87,6 +89,7 @@ def gather(pair: Pair, tolerance: float | None = None) -> tuple[Evidence, dict[s
         ground_spread_m=shape.spread_m if np.isfinite(shape.spread_m) else None,
         ground_relief_m=shape.relief_m if np.isfinite(shape.spread_m) else None,
         ground_noise_m=shape.noise_m if np.isfinite(shape.spread_m) else None,
+        heights_elsewhere=None if common is None else common.elsewhere,
         repeats=matches is not None and matches.repeats,
         self_likeness=matches.self_likeness if matches is not None else None,
         refined_away_m=_refined_away(pair, T),

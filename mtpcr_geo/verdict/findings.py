@@ -313,6 +313,20 @@ def objects_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
     )
 
 
+def heights_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
+    """Judge whether the clouds meet at this height, or at another one."""
+    if evidence.heights_elsewhere is None or evidence.heights_elsewhere[0] <= limits.heights_elsewhere:
+        return None
+    times, rise = evidence.heights_elsewhere
+    value, _ = beside(times, limits.heights_elsewhere, 1)
+    way = "higher" if rise > 0 else "lower"
+    return CheckFinding(
+        f"{abs(rise):.1f} m {way}, {value} times as many heights of the source would meet the target's: the "
+        "place is wrong, or points below the ground (multipath) hide it; leave these out, or classify them "
+        "as noise (7)"
+    )
+
+
 def null_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
     """Judge the strength of the pose against what a mirrored source reaches."""
     if evidence.null_ratio is None or evidence.null_ratio >= limits.null_ratio:

@@ -51,6 +51,9 @@ class Evidence:
             there are too few.
         objects_missing: share of one cloud's objects at whose place the other sees bare ground only, see
             `free_space.missing_share`; None where there are too few.
+        heights_elsewhere: how many times as many heights both clouds would fill in the same columns, were the
+            source raised, and raised by how many metres, see `method.common_heights`; None where they share
+            too few columns.
         sliding: the motion in plan that the fit tells least; None where that is not known.
         drift: how what is left bends along the overlap; None where that is not known.
         contradictions: what was known beforehand and is not so, a sentence each.
@@ -90,6 +93,7 @@ class Evidence:
     quarters_m: tuple[float, float] | None = None
     free_space: float | None = None
     objects_missing: float | None = None
+    heights_elsewhere: tuple[float, float] | None = None
     sliding: Sliding | None = None
     drift: Drift | None = None
     narrow_prior: bool = False
@@ -124,6 +128,8 @@ class Limits:
             is 3 to 11, under 50 wrong ones 14 and more but for three. Less, in proportion, where fewer than
             `mtpcr_geo.verdict.findings.AGREE_AMONG_ROWS` of the tie points agree.
         objects_missing: greatest share of objects missing in the other cloud to accept.
+        heights_elsewhere: times as many common heights that another height may have at most to accept: under
+            true poses of nine real and thirty simulated pairs it has 0.7 at most.
 
     """
 
@@ -142,3 +148,4 @@ class Limits:
     ground_shape_if_sure: float = 0.7
     ground_noise_of_rows: float = 12.0
     objects_missing: float = 0.10
+    heights_elsewhere: float = 1.0

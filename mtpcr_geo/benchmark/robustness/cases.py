@@ -8,7 +8,7 @@ displaces the source by a known transform, so that the truth is its inverse.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,6 +17,7 @@ import numpy as np
 
 from mtpcr_geo.benchmark.metrics import overlap_ratios
 from mtpcr_geo.benchmark.pairs import BenchmarkPair, load_pair, read_facts
+from mtpcr_geo.benchmark.robustness.degrade import WAYS
 from mtpcr_geo.benchmark.robustness.places import dense_places, shared_places
 from mtpcr_geo.benchmark.worker import StartRange
 from mtpcr_geo.core import transforms
@@ -288,6 +289,28 @@ class DiscClouds:
         centre = shared_places(pair.source, pair.target, PLACES, rng)[self.place]
         part = disc(pair.source, centre, self.radius)
         return CommonFrame(part, pair.target, pair.overlap_cell_m, known=known_to(self.folder))
+
+
+@dataclass(frozen=True)
+class DegradedClouds:
+    """A pair whose source another instrument might have seen.
+
+    Attributes:
+        folder: of the pair.
+        way: name of one of `degrade.WAYS`.
+        seed: of what is drawn.
+
+    """
+
+    folder: Path
+    way: str
+    seed: int = 0
+
+    def make(self) -> CommonFrame:
+        """Return the source made worse, and the target."""
+        made = FolderClouds(self.folder).make()
+        rng = np.random.default_rng([self.seed, *self.folder.name.encode(), *self.way.encode()])
+        return replace(made, source=WAYS[self.way](made.source, rng))
 
 
 @dataclass(frozen=True)

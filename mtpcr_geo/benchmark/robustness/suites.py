@@ -15,12 +15,14 @@ from mtpcr_geo.benchmark.pairs import pair_folders
 from mtpcr_geo.benchmark.robustness.cases import (
     PLACES,
     Case,
+    DegradedClouds,
     DiscClouds,
     ElsewhereClouds,
     FolderClouds,
     MirroredClouds,
     UnrelatedClouds,
 )
+from mtpcr_geo.benchmark.robustness.degrade import WAYS
 from mtpcr_geo.benchmark.robustness.simulated import (
     PlotClouds,
     RepeatingClouds,
@@ -159,6 +161,15 @@ def _discs(options: SuiteOptions) -> Iterator[Case]:
                 )  # fmt: skip
 
 
+def _degraded(options: SuiteOptions) -> Iterator[Case]:
+    for folder in options.folders():
+        for way in WAYS:
+            yield Case(
+                "degraded", folder.name, way, DegradedClouds(folder, way, options.seed), options.seed,
+                ranges=options.ranges,
+            )  # fmt: skip
+
+
 def _unrelated(options: SuiteOptions) -> Iterator[Case]:
     folders = options.folders()
     for source in folders:
@@ -261,6 +272,7 @@ SUITES: dict[str, Callable[[SuiteOptions], Iterator[Case]]] = {
     "pairs": _pairs,
     "tilts": _tilts,
     "discs": _discs,
+    "degraded": _degraded,
     "plots": _plots,
     "swap": _swap,
     "repeating": _repeating,
@@ -272,9 +284,9 @@ SUITES: dict[str, Callable[[SuiteOptions], Iterator[Case]]] = {
     "standins": _standins,
     "overlap": _overlap,
 }
-"""The suites: pairs (real pairs, upright), tilts (the same, local and tilted), discs (cut from them), plots
-(simulated ground plots), swap (both ways), repeating (sites that repeat themselves), repeating-apart (without
-overlap), symmetric (sites that look the same when turned by half), unrelated (other sites), mirrored (the
-source reflected), elsewhere (discs against the target without their surroundings), standins and overlap
-(simulated, as `mtpcr-geo benchmark` has them).
+"""The suites: pairs (real pairs, upright), tilts (the same, local and tilted), discs (cut from them),
+degraded (as other instruments and seasons would have them), plots (simulated ground plots), swap (both ways),
+repeating (sites that repeat themselves), repeating-apart (without overlap), symmetric (sites that look the
+same when turned by half), unrelated (other sites), mirrored (the source reflected), elsewhere (discs against
+the target without their surroundings), standins and overlap (simulated, as `mtpcr-geo benchmark` has them).
 """

@@ -195,6 +195,7 @@ class Refine(Stage):
             refined_from_search,
             refined_pair,
         )
+        from mtpcr_geo.pipeline.stages.raised import raised
         from mtpcr_geo.pipeline.stages.rasters import rasterised
 
         pair = self.one_pair(inputs)
@@ -219,7 +220,12 @@ class Refine(Stage):
         def raster_at(side: Side, cell: float) -> Bev:
             return rasterised(side, cell, "centre", context)
 
-        if options.feedback:
+        higher = raised(pair, refinement, settings) if options.feedback else None
+        if higher is not None:
+            self.metadata["raised"] = True
+            pair, refinement = pair.with_(T_target_source=higher.T_before), higher
+            settings = replace(settings, ground=False)
+        elif options.feedback:
             elsewhere = refined_from_search(pair, refinement, settings)
             if elsewhere is not None:
                 pair, refinement = pair.with_(T_target_source=elsewhere.T_before), elsewhere
