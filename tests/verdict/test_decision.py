@@ -61,6 +61,8 @@ def test_crops_on_the_ground_of_a_pose_that_is_sure_are_borne() -> None:
         ({"refinement_lost": True}, "doubtful"),
         ({"objects_missing": 0.14}, "doubtful"),
         ({"objects_missing": 0.07}, "accepted"),
+        ({"heights_elsewhere": (1.2, -7.5)}, "doubtful"),
+        ({"heights_elsewhere": (0.7, 2.0)}, "accepted"),
         ({"null_ratio": 1.65}, "doubtful"),
         ({"ground_agreeing": 590}, "doubtful"),
     ],

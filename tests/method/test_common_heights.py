@@ -1,0 +1,84 @@
+"""The height that all points of both clouds tell, whatever their lowest ones say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers_scene import houses
+
+import mtpcr_geo as mg
+from mtpcr_geo.benchmark.robustness.degrade import multipath
+from mtpcr_geo.core import transforms
+from mtpcr_geo.method.common_heights import common_heights
+
+RNG = np.random.default_rng
+
+
+def grove(seed: int, n: int = 60_000, size: float = 30.0) -> np.ndarray:
+    """Sampled trees of 6 to 14 m on gently rolling ground, dense enough to hide it below mirror images."""
+    trees = RNG(5).uniform(0.0, size, (25, 2))
+    tall = RNG(6).uniform(6.0, 14.0, 25)
+    rng = RNG(seed)
+    xy = rng.uniform(0.0, size, (n // 2, 2))
+    which = rng.integers(0, 25, n // 2)
+    crown = trees[which] + rng.normal(0.0, 0.9, (n // 2, 2))
+    up = tall[which] * rng.uniform(0.35, 1.0, n // 2)
+    ground = [0.4 * np.sin(p[:, 0] / 5.0) + 0.3 * np.cos(p[:, 1] / 7.0) for p in (xy, crown)]
+    points = np.vstack([np.column_stack([xy, ground[0]]), np.column_stack([crown, ground[1] + up])])
+    return points + rng.normal(0.0, 0.02, points.shape)
+
+
+@pytest.mark.parametrize("off", [0.0, 4.0, -7.5])
+def test_the_height_at_which_the_clouds_meet_is_told(off: float) -> None:
+    found = common_heights(grove(1) + [0, 0, off], grove(2), 0.5, 0.5)
+    assert found is not None
+    times, rise = found.elsewhere
+    if off == 0.0:
+        assert times < 0.8
+    else:
+        assert times > 1.4
+        assert rise == pytest.approx(-off, abs=0.5)
+
+
+def test_exchanged_clouds_are_raised_the_other_way() -> None:
+    source, target = grove(1) + [0, 0, 3], grove(2)
+    forth, back = common_heights(source, target, 0.5, 0.5), common_heights(target, source, 0.5, 0.5)
+    assert forth is not None
+    assert back is not None
+    assert back.columns == forth.columns
+    assert back.elsewhere == pytest.approx((forth.elsewhere[0], -forth.elsewhere[1]), rel=1e-5)
+
+
+def test_points_below_the_ground_do_not_change_the_height() -> None:
+    source = multipath(grove(1), RNG(3))
+    assert len(source) > 60_000
+    found = common_heights(source, grove(2), 0.5, 0.5)
+    assert found is not None
+    assert found.elsewhere[0] < 0.8
+
+
+def test_a_stray_point_kilometres_above_costs_no_memory() -> None:
+    source = np.vstack([grove(1), [[15.0, 15.0, 9_000.0]]])
+    found = common_heights(source, grove(2), 0.5, 0.5)
+    assert found is not None
+    assert found.elsewhere[0] < 0.8
+
+
+@pytest.mark.parametrize("away", [[500.0, 0.0, 0.0], [29.9, 0.0, 0.0]])
+def test_clouds_that_share_too_little_tell_nothing(away: list[float]) -> None:
+    assert common_heights(houses(RNG(1), 500) + away, houses(RNG(2), 500) - away, 1.0, 0.5) is None
+
+
+def test_a_plot_whose_ground_lies_below_mirror_images_is_registered() -> None:
+    T = transforms.translation([30.0, -12.0, 5.0]) @ transforms.about(
+        np.zeros(3), transforms.yaw_matrix(np.radians(100.0))
+    )
+    source = transforms.apply(transforms.inverse(T), multipath(grove(1), RNG(3)))
+    found = mg.register(source, grove(2), level="none", recording=False)
+    assert found.T_target_source is not None
+    left = found.T_target_source @ transforms.inverse(T)
+    middle = np.array([[15.0, 15.0, 4.0]])
+    assert np.linalg.norm(transforms.apply(left, middle) - middle) < 0.1
+    assert np.degrees(transforms.rotation_angle(left[:3, :3])) < 0.3
+    metrics = found.verdict.metrics
+    assert metrics["heights_elsewhere"] < 0.9
