@@ -171,7 +171,7 @@ def test_suites_list_the_runs_that_are_asked_for(data):
     chosen = {name: list(cases([name], options)) for name in SUITES}
     counts = {name: len(runs) for name, runs in chosen.items()}
     assert counts == {
-        "pairs": 4, "tilts": 4, "discs": 36, "plots": 100, "swap": 2, "repeating": 60,
+        "pairs": 4, "tilts": 4, "discs": 36, "degraded": 26, "plots": 100, "swap": 2, "repeating": 60,
         "repeating-apart": 60, "symmetric": 40, "unrelated": 4, "mirrored": 14, "elsewhere": 12,
         "standins": 28, "overlap": 49,
     }  # fmt: skip

@@ -70,7 +70,7 @@ def test_clouds_that_share_too_little_tell_nothing(away: list[float]) -> None:
 
 
 def test_a_plot_whose_ground_lies_below_mirror_images_is_registered() -> None:
-    T = transforms.translation([30.0, -12.0, 5.0]) @ transforms.about(
+    T = transforms.translation((30.0, -12.0, 5.0)) @ transforms.about(
         np.zeros(3), transforms.yaw_matrix(np.radians(100.0))
     )
     source = transforms.apply(transforms.inverse(T), multipath(grove(1), RNG(3)))
@@ -82,3 +82,5 @@ def test_a_plot_whose_ground_lies_below_mirror_images_is_registered() -> None:
     assert np.degrees(transforms.rotation_angle(left[:3, :3])) < 0.3
     metrics = found.verdict.metrics
     assert metrics["heights_elsewhere"] < 0.9
+    refined = next(stage for stage in found.report if stage.type == "mtpcr.refine")
+    assert refined.metadata["raised"] is True

@@ -29,8 +29,10 @@ HOLES = 0.5
 MULTIPATH = 0.05
 
 _GROUND_CELL_M = 4.0
-_BEAMS = 1440
-"""Directions around a scanner: a quarter of a degree."""
+_BEAMS = 180
+"""Directions around a scanner, 2 degrees apart: between aerial points it would see through walls."""
+_BEHIND = 1.3
+"""Times as far as the nearest point of a direction beyond which others are hidden."""
 
 Way = Callable[[Floats, np.random.Generator], Floats]
 
@@ -136,7 +138,7 @@ def one_station(xyz: Floats, rng: np.random.Generator) -> Floats:
     beam = beam * _BEAMS + np.floor((up + np.pi / 2.0) / np.pi * _BEAMS).astype(np.int64)
     nearest = np.full(int(beam.max()) + 1, np.inf)
     np.minimum.at(nearest, beam, distance)
-    seen = distance < nearest[beam] + 0.3
+    seen = distance < _BEHIND * nearest[beam]
     reach = np.quantile(distance, 0.25)
     return np.asarray(xyz[seen & (rng.random(len(xyz)) < (reach / distance) ** 2)])
 
