@@ -144,7 +144,7 @@ The metrics:
 - ``metrics.solid_cells``: cells inside roofs of one cloud that the other fills
 - ``metrics.free_space_conflicts``: of these, cells in which the other sees the ground
 - ``metrics.heights_elsewhere``: how many times as many heights both clouds would fill in the same columns,
-  were the source raised or lowered; null where they share too few columns
+  were the source raised or lowered; null where their lowest points are ground, or they share too few columns
 - ``metrics.objects_missing``: share of what stands higher than 2.5 m in one cloud at whose place the other
   sees bare ground only, in the direction in which it is less; null where too little stands in the overlap
 - ``metrics.sigma_plan_m``: standard deviation of the middle of the overlap in plan, along its weakest

@@ -4,6 +4,9 @@ The height of a fit rests on the ground, which is one point in each cell: where 
 (multipath, mirror images in wet streets) hide it from one cloud, its lowest points lie metres too deep, and
 tie points and ground agree on that. All points together do not: walls, crowns and roofs of the same place
 fill the same heights of the same columns at one height only.
+
+Not so inside buildings: raised by a storey a floor meets a ceiling, or a ceiling the roof. So all points are
+asked only where the lowest ones of a cloud are no ground: where they lie up and down from column to column.
 """
 
 from __future__ import annotations
@@ -28,6 +31,11 @@ MOST_BINS = 4_000_000
 FEWEST_COLUMNS = 30
 COLUMN_CELLS = 2.0
 """Edge of a column in cells of the rasters, which hold a few points each."""
+ROUGH = 0.3
+"""Share of columns whose lowest point lies more than a bin above or below those around it, from which on the
+lowest points of a cloud are no ground. Of eight real pairs it is 0.18 at most, of a pine plot 0.33; with a
+twentieth of the points mirrored below the ground, 0.36 to 0.82 in clouds of 5 points/m² and more."""
+FEWEST_AROUND = 5
 BESIDE_BINS = 3
 """Bins from which on another height is another one, and not the same a little off."""
 
@@ -40,12 +48,20 @@ class CommonHeights:
         rise_m: (k,) metres by which the source is raised, ascending; one of them is 0.
         filled: (k,) bins of height that both fill, of a column, in the mean.
         columns: columns in which both have points.
+        rough: share of these in which the lowest point of the cloud where it is more lies more than a bin
+            above or below those around it.
 
     """
 
     rise_m: Floats
     filled: Floats
     columns: int
+    rough: float
+
+    @property
+    def asked(self) -> bool:
+        """Whether the lowest points of a cloud are so uneven that all points are asked for the height."""
+        return self.rough >= ROUGH
 
     @property
     def here(self) -> float:
@@ -117,8 +133,9 @@ def common_heights(source: Floats, target: Floats, column_m: float, bin_m: float
     place = np.full(shape[0] * shape[1], -1)
     place[chosen] = np.arange(len(chosen))
     size = fft.next_fast_len(2 * height, real=True)
-    spectra = []
-    for (_, column), one in zip(cells, bins, strict=True):
+    spectra, rough = [], 0.0
+    for (xyz, column), one in zip(cells, bins, strict=True):
+        rough = max(rough, _roughness(xyz[:, 2], column, chosen, shape, bin_m))
         row = place[column]
         image = np.zeros((len(chosen), height), np.float32)
         image[row[row >= 0], one[row >= 0] - lowest] = 1.0
@@ -127,7 +144,25 @@ def common_heights(source: Floats, target: Floats, column_m: float, bin_m: float
     counts = fft.irfft(product, size)
     filled = np.concatenate([counts[size - height + 1 :], counts[:height]]) / len(chosen)
     rise = np.arange(1 - height, height).astype(np.float64) * bin_m
-    return CommonHeights(rise, filled.astype(np.float64), len(numbers))
+    return CommonHeights(rise, filled.astype(np.float64), len(numbers), rough)
+
+
+def _roughness(
+    z: Floats, column: NDArray[np.int64], chosen: NDArray[np.int64], shape: list[int], bin_m: float
+) -> float:
+    """Return the share of chosen columns whose lowest point lies off the median of those around by a bin."""
+    lowest = np.full((shape[0] + 2, shape[1] + 2), np.nan)
+    filled = np.full(shape[0] * shape[1], np.inf)
+    np.minimum.at(filled, column, z)
+    lowest[1:-1, 1:-1] = np.where(np.isfinite(filled), filled, np.nan).reshape(shape)
+    i, j = np.divmod(chosen, shape[1])
+    steps = [(a, b) for a in (0, 1, 2) for b in (0, 1, 2) if (a, b) != (1, 1)]
+    around = np.stack([lowest[i + a, j + b] for a, b in steps], axis=1)
+    known = np.isfinite(around).sum(axis=1) >= FEWEST_AROUND
+    if not known.any():
+        return 0.0
+    off = lowest[i + 1, j + 1][known] - np.nanmedian(around[known], axis=1)
+    return float((np.abs(off) > bin_m).mean())
 
 
 def _cells(xyz: Floats, low: Floats, shape: list[int], column_m: float) -> tuple[Floats, NDArray[np.int64]]:

@@ -206,11 +206,12 @@ def _heights(evidence: Evidence, limits: Limits) -> Check:
     meaning = (
         "heights at which both clouds have points in the same columns, were the source raised or lowered, "
         "over those at which they have as it lies: walls, crowns and roofs of one place meet at one height "
-        "only."
+        "only. Asked where the lowest points of a cloud are so uneven that they are no ground."
     )
     wanted = f"at most {limits.heights_elsewhere:g} times as many elsewhere"
     if evidence.heights_elsewhere is None:
-        return Check("common heights", "too few columns", wanted, None, meaning)
+        value = "not asked: the lowest points are ground, or too few columns are shared"
+        return Check("common heights", value, wanted, None, meaning)
     times, rise = evidence.heights_elsewhere
     value, _ = beside(times, limits.heights_elsewhere, 2)
     return Check("common heights", f"{value} times as many {rise:+.1f} m from here", wanted, True, meaning)

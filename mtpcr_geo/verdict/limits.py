@@ -52,8 +52,8 @@ class Evidence:
         objects_missing: share of one cloud's objects at whose place the other sees bare ground only, see
             `free_space.missing_share`; None where there are too few.
         heights_elsewhere: how many times as many heights both clouds would fill in the same columns, were the
-            source raised, and raised by how many metres, see `method.common_heights`; None where they share
-            too few columns.
+            source raised, and raised by how many metres, see `method.common_heights`; None where the lowest
+            points of both are ground, or they share too few columns.
         sliding: the motion in plan that the fit tells least; None where that is not known.
         drift: how what is left bends along the overlap; None where that is not known.
         contradictions: what was known beforehand and is not so, a sentence each.

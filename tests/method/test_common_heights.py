@@ -54,7 +54,25 @@ def test_points_below_the_ground_do_not_change_the_height() -> None:
     assert len(source) > 60_000
     found = common_heights(source, grove(2), 0.5, 0.5)
     assert found is not None
+    assert found.asked
     assert found.elsewhere[0] < 0.8
+
+
+def test_floors_and_ceilings_are_not_taken_for_another_height() -> None:
+    """A hall seen from inside, with a strip outside, against its flat roof two storeys higher."""
+    rng = RNG(4)
+
+    def flat(n: int, low: tuple[float, float], high: tuple[float, float], z: float) -> np.ndarray:
+        xy = rng.uniform(low, high, (n, 2))
+        return np.column_stack([xy, np.full(n, z)]) + rng.normal(0.0, 0.01, (n, 3))
+
+    inside = [flat(20_000, (0, 0), (40, 30), z) for z in (0.0, 4.0)]
+    source = np.vstack([*inside, flat(6_000, (0, 30), (40, 40), -0.2)])
+    target = np.vstack([flat(8_000, (0, 0), (40, 30), 9.0), flat(12_000, (0, 30), (40, 60), -0.2)])
+    found = common_heights(source, target, 1.0, 0.5)
+    assert found is not None
+    assert found.elsewhere[0] > 1.0
+    assert not found.asked
 
 
 def test_a_stray_point_kilometres_above_costs_no_memory() -> None:

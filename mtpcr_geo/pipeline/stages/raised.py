@@ -31,11 +31,12 @@ def raised(pair: Pair, refined: Refinement, settings: RefineSettings) -> Refinem
         settings: of that.
 
     Returns:
-        None where no other height is clearly better, before and after that refinement.
+        None where the lowest points are ground, or no other height is clearly better, before and after that
+        refinement.
 
     """
     before = common_heights_of(pair, refined.T)
-    if before is None or before.elsewhere[0] < CLEARLY:
+    if before is None or not before.asked or before.elsewhere[0] < CLEARLY:
         return None
     up = transforms.translation(before.elsewhere[1] * pair.target.T_level_work[2, :3])
     try:
