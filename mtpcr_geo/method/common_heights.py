@@ -20,11 +20,14 @@ from scipy import fft
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Floats, Mask
 from mtpcr_geo.core.types import Pair
+from mtpcr_geo.method.bev import fitting_cell
 from mtpcr_geo.method.scales import tolerance_for
 from mtpcr_geo.method.upright import points_near, seen_upright
 
 MOST_POINTS = 500_000
 """Points of each cloud that are looked at, evenly chosen."""
+MOST_AREA_COLUMNS = 250_000
+"""Columns over the area that both clouds may share; instead of more of them they are made wider."""
 MOST_COLUMNS = 4_000
 MOST_BINS = 4_000_000
 """Columns, and columns times heights, that are looked at: shared columns are evenly chosen."""
@@ -105,7 +108,8 @@ def common_heights(source: Floats, target: Floats, column_m: float, bin_m: float
 
     Args:
         source, target: (n, 3) and (m, 3) metres in one frame, z up.
-        column_m: edge of a column, metres: a few points of the sparser cloud should lie in each.
+        column_m: edge of a column, metres: a few points of the sparser cloud should lie in each. Doubled over
+            large areas.
         bin_m: bin of height, metres.
 
     Returns:
@@ -116,6 +120,7 @@ def common_heights(source: Floats, target: Floats, column_m: float, bin_m: float
     low, high = np.maximum(low_s, low_t)[:2], np.minimum(high_s, high_t)[:2]
     if (high <= low).any():
         return None
+    column_m = fitting_cell(low, high, column_m, MOST_AREA_COLUMNS)
     shape = (np.floor((high - low) / column_m).astype(np.int64) + 1).tolist()
     floor = float(min(low_s[2], low_t[2]))
     cells = [_cells(xyz, low, shape, column_m) for xyz in (source, target)]

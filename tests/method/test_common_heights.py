@@ -58,6 +58,17 @@ def test_points_below_the_ground_do_not_change_the_height() -> None:
     assert found.elsewhere[0] < 0.8
 
 
+def test_a_wide_area_is_looked_at_in_wider_columns() -> None:
+    apart = np.array([[0.0, 0.0, 0.0], [40_000.0, 40_000.0, 0.0]])
+    source, target = (np.vstack([grove(seed) + end for end in apart]) for seed in (1, 2))
+    found = common_heights(source + [0, 0, 4], target, 0.5, 0.5)
+    # columns of 128 m: too few of them are filled
+    assert found is None
+    near = common_heights(source[:60_000] + [0, 0, 4], target, 0.5, 0.5)
+    assert near is not None
+    assert near.elsewhere[1] == pytest.approx(-4.0, abs=0.5)
+
+
 def test_floors_and_ceilings_are_not_taken_for_another_height() -> None:
     """A hall seen from inside, with a strip outside, against its flat roof two storeys higher."""
     rng = RNG(4)
