@@ -215,6 +215,8 @@ class Refinement(ComparesArrays):
         again: why clouds were matched and solved a second time before, or refined from another place than the
             tie points', for people; None where they were not.
         T_solved: 4x4 where the tie points had led, if the refinement began elsewhere; None if it began there.
+        raised: whether it began again, without the ground, at the height at which far more of both clouds
+            meets than where their lowest points had led.
 
     """
 
@@ -227,6 +229,7 @@ class Refinement(ComparesArrays):
     slid_m: float | None = None
     again: str | None = None
     T_solved: Floats | None = None
+    raised: bool = False
 
     def audit(self) -> dict[str, Any]:
         """Return what each step did, for the audit."""
@@ -236,6 +239,8 @@ class Refinement(ComparesArrays):
             "ground_after": self.ground_after,
         }
         found: dict[str, Any] = {name: step.audit() for name, step in steps.items() if step is not None}
+        if self.raised:
+            found["raised"] = True
         return found if self.slid_m is None else {**found, "slid_m": self.slid_m}
 
     def in_frame(self, A: Floats) -> Refinement:

@@ -12,7 +12,7 @@ from mtpcr_geo.core import transforms
 from mtpcr_geo.core.types import Levelling, Pair
 from mtpcr_geo.method.refine import RefineSettings
 from mtpcr_geo.method.upright import seen_upright
-from mtpcr_geo.pipeline.stages.feedback import refined_pair
+from mtpcr_geo.pipeline.stages.refining import refined_pair
 from mtpcr_geo.verdict.evidence import agreement, gather
 
 LAID = {

@@ -21,13 +21,14 @@ from mtpcr_geo.core.types import Bev, Levelling, Pair, Refinement, Side
 from mtpcr_geo.match.registry import CorrelationMatcher
 from mtpcr_geo.method.icp import Surfaces, rounds_for
 from mtpcr_geo.method.inverse_mapping import tie_points_of
-from mtpcr_geo.method.refine import FEW_TIE_POINTS, RefineSettings, refine, target_moves
+from mtpcr_geo.method.refine import FEW_TIE_POINTS, RefineSettings, target_moves
 from mtpcr_geo.method.scales import tolerance_for
 from mtpcr_geo.method.solve import solve_tie_points
-from mtpcr_geo.method.upright import points_near, seen_upright
+from mtpcr_geo.method.upright import points_near
 from mtpcr_geo.pipeline.stages.priors import prior_of
+from mtpcr_geo.pipeline.stages.refining import refined_pair
 from mtpcr_geo.pipeline.stages.views import shown, view_of
-from mtpcr_geo.verdict.evidence import middle_of_tie_points, moved_in_plan, tie_points_agreeing
+from mtpcr_geo.verdict.evidence import moved_in_plan, tie_points_agreeing
 
 LEAST_TILT_DEG = 0.3
 """Tilt left between the levelled clouds from which on a new vertical is worth a second search."""
@@ -300,32 +301,6 @@ def borne_out(before: Refinement, after: Refinement) -> bool:
     first, last = (one.tried[one.chosen].surface_residual for one in (before.icp, after.icp))
     contradicted = after.icp.lost_tie_points or after.icp.left_tie_points
     return after.icp.followed and not contradicted and last <= CLOSER * first
-
-
-def refined_pair(pair: Pair, settings: RefineSettings) -> Refinement:
-    """Refine the transform of a pair.
-
-    Args:
-        pair: with a transform; tie points tell the middle of the overlap, and what agrees.
-        settings: of the refinement.
-
-    Raises:
-        RegistrationError: if too little of the clouds is brought together.
-
-    """
-    seen = seen_upright(pair)
-    assert seen.T_target_source is not None
-    found = refine(
-        points_near(seen.source),
-        points_near(seen.target),
-        seen.T_target_source,
-        settings,
-        cell=pair.cell,
-        agreeing=lambda T: tie_points_agreeing(seen, T),
-        pivot=middle_of_tie_points(pair),
-        R_upright=seen.target.T_level_work[:3, :3].T @ seen.source.T_level_work[:3, :3],
-    )
-    return found if seen is pair else found.in_frame(transforms.inverse(pair.target.T_level_work))
 
 
 def _solved(again: Pair, before: Pair) -> Pair:

@@ -193,10 +193,9 @@ class Refine(Stage):
             fed_back,
             matched_coarser,
             refined_from_search,
-            refined_pair,
         )
-        from mtpcr_geo.pipeline.stages.raised import raised
         from mtpcr_geo.pipeline.stages.rasters import rasterised
+        from mtpcr_geo.pipeline.stages.refining import refined_pair
 
         pair = self.one_pair(inputs)
         if pair.T_target_source is None:
@@ -220,12 +219,7 @@ class Refine(Stage):
         def raster_at(side: Side, cell: float) -> Bev:
             return rasterised(side, cell, "centre", context)
 
-        higher = raised(pair, refinement, settings) if options.feedback else None
-        if higher is not None:
-            self.metadata["raised"] = True
-            pair, refinement = pair.with_(T_target_source=higher.T_before), higher
-            settings = replace(settings, ground=False)
-        elif options.feedback:
+        if options.feedback:
             elsewhere = refined_from_search(pair, refinement, settings)
             if elsewhere is not None:
                 pair, refinement = pair.with_(T_target_source=elsewhere.T_before), elsewhere
