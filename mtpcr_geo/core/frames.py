@@ -188,7 +188,7 @@ def _transformer(pipeline: str) -> Transformer:
 
     try:
         return Transformer.from_pipeline(pipeline)
-    except ProjError as error:
+    except (ProjError, UnicodeEncodeError) as error:  # half a character, as JSON may hold, is no text
         raise CrsError(
             f"PROJ cannot run the pipeline {pipeline!r} ({error}); is a grid missing on this machine?"
         ) from error

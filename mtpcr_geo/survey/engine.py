@@ -166,7 +166,9 @@ def engine_of(options: EngineOptions, most: int) -> Iterator[Engine]:
                 n_workers=wanted,
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address=None,
+                # any free port of this machine alone: the usual one may be another run's
+                dashboard_address="127.0.0.1:0",
+                scheduler_kwargs={"dashboard": False},
                 silence_logs=logging.CRITICAL,
             ) as cluster,
             Client(cluster, set_as_default=False) as client,

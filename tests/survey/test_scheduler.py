@@ -12,6 +12,7 @@ from helpers_survey import digests, tiles_of, town_source, town_target, write_ti
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.survey.batch import run_batch
 from mtpcr_geo.survey.build import build_survey
+from mtpcr_geo.survey.engine import EngineOptions, engine_of
 from mtpcr_geo.survey.jobs import Job
 from mtpcr_geo.survey.options import BatchOptions, BuildOptions
 
@@ -30,7 +31,7 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     os.chdir(tmp_path_factory.mktemp("elsewhere"))
     try:
         cluster = distributed.LocalCluster(
-            n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
+            n_workers=1, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
         )
     finally:
         os.chdir(here)
@@ -81,3 +82,10 @@ def test_workers_that_see_other_folders_are_told(
     assert (row.verdict, row.folder) == ("failed", "")
     assert "must see the same folders" in row.reason
     assert (folder / "batch" / "rows" / "scan.json").is_file()
+
+
+def test_two_runs_of_one_machine_do_not_want_the_same_port() -> None:
+    """A warning of the second is an error here."""
+    options = EngineOptions(workers=2)
+    with engine_of(options, 2) as one, engine_of(options, 2) as other:
+        assert one is not other
