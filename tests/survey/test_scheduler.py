@@ -12,9 +12,9 @@ from helpers_survey import digests, tiles_of, town_source, town_target, write_ti
 from mtpcr_geo.core.errors import OutputError
 from mtpcr_geo.survey.batch import run_batch
 from mtpcr_geo.survey.build import build_survey
-from mtpcr_geo.survey.engine import EngineOptions, engine_of
+from mtpcr_geo.survey.engine import engine_of
 from mtpcr_geo.survey.jobs import Job
-from mtpcr_geo.survey.options import BatchOptions, BuildOptions
+from mtpcr_geo.survey.options import BatchOptions, BuildOptions, EngineOptions
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed")
 pytestmark = pytest.mark.slow
