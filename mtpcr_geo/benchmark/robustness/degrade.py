@@ -146,7 +146,7 @@ def one_station(xyz: Floats, rng: np.random.Generator) -> Floats:
 def heights(xyz: Floats) -> Floats:
     """Return the height (n,) of each point above the lowest ones about it, metres.
 
-    The lowest of each cell of 4 m, opened over three cells; cells without points take their neighbours'.
+    The ground is the lowest point of each cell of 4 m, opened over three cells.
     """
     cell: Indices = np.floor(xyz[:, :2] / _GROUND_CELL_M).astype(np.int64)
     cell -= cell.min(axis=0)
