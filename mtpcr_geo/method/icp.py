@@ -300,10 +300,12 @@ class Surfaces:
 def rounds_for(cell: float) -> dict[str, Rounds]:
     """Name the runs of ICP to try on clouds rasterised at ``cell`` metres: from far, and from near.
 
-    Those from far catch starts that are off by metres. Both end in the same rounds.
+    Those from far catch starts that are off by metres. Those from near begin at a cell, by which tie points
+    may be off: on the rings of single scans, which have fine cells, a farther one leads a good start away.
     """
     scale = max(1.0, cell / FINE_CELL_M)
     far, close = (
         tuple(scale * distance for distance in distances) for distances in (FAR_DISTANCES_M, NEAR_DISTANCES_M)
     )
-    return {"far": Rounds((*far, *close)), "near": Rounds((*close, close[-1]), trim_m=close[0])}
+    first = float(np.clip(cell, close[-1], close[0]))
+    return {"far": Rounds((*far, *close)), "near": Rounds((first, close[-1], close[-1]), trim_m=first)}

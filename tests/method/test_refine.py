@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+from pathlib import Path
+
+import laspy
 import numpy as np
 import pytest
 from helpers_plots import plot
 from helpers_scene import houses, make_pair
 
+from mtpcr_geo.benchmark.metrics import rotation_error_deg
 from mtpcr_geo.benchmark.steps import follow, level_pair
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.errors import RegistrationError
@@ -133,6 +137,31 @@ def test_reaches_grow_with_coarse_cells_and_end_alike() -> None:
     for name in ("far", "near"):
         doubled = tuple(2 * one for one in fine[name].max_correspondence_distances_m)
         assert coarse[name].max_correspondence_distances_m == doubled
+
+
+def test_rounds_from_near_begin_at_a_fine_cell() -> None:
+    farthest, nearest = NEAR_DISTANCES_M
+    for cell, first in ((0.25, nearest), (0.7, 0.7), (1.0, farthest), (2.0, farthest)):
+        near = rounds_for(cell)["near"]
+        assert near.max_correspondence_distances_m[0] == near.trim_m == first
+
+
+def test_single_scans_come_together_from_any_start_that_is_nearly_right(shared_data: Path) -> None:
+    # a metre from their partners coarse points of a ring meet the next ring, and the scan leans with them
+    folder = shared_data / "robot_scans"
+    source, target = (np.asarray(laspy.read(folder / f"{role}.laz").xyz) for role in ("source", "target"))
+    middle, found = source.mean(axis=0), []
+    for turn, shift in (
+        ((0.22, -0.6, -0.48), (0.1, -0.2, 0.1)),
+        ((0.5, -0.62, 0.1), (-0.2, 0.1, 0.0)),
+        ((-0.41, -0.68, -0.13), (0.0, 0.1, -0.1)),
+    ):
+        angle = float(np.linalg.norm(turn))
+        R = transforms.axis_angle_matrix(np.array(turn) / angle, np.radians(angle))
+        start = transforms.translation(shift) @ transforms.about(middle, R)
+        found.append(refine(source, target, start, cell=0.25, agreeing=lambda T: 20).T)
+    for one in found[1:]:
+        assert rotation_error_deg(one, found[0]) < 0.05
 
 
 def test_misfit_is_least_where_surfaces_meet_and_goes_with_the_frame(clouds) -> None:
