@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,27 @@ settings.register_profile(
 )
 settings.register_profile("explore", settings.get_profile("repeatable"), derandomize=False)
 settings.load_profile("repeatable")
+
+BEGUN = time.monotonic()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--within", type=float, metavar="MINUTES", help="skip, by name, tests that have not begun by then"
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Run the tests of real data first where the time is limited: they are the last to be left out."""
+    if config.getoption("within") is not None:
+        real = {"shared_data", "shared_cases"}
+        items.sort(key=lambda item: real.isdisjoint(getattr(item, "fixturenames", ())))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    within = item.config.getoption("within")
+    if within is not None and time.monotonic() - BEGUN > 60 * within:
+        pytest.skip(f"not begun within {within:g} minutes")
 
 
 def _shared(name: str) -> Path:

@@ -18,6 +18,7 @@ import os, signal, sys
 from pathlib import Path
 from mtpcr_geo.io.outputs import OutputSet
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # who starts this in the background has it ignored
 place, at, number = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 calls = 0
 def counted(function):
