@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
 from mtpcr_geo.core import transforms
 from mtpcr_geo.core.arrays import Mask
+from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.match.candidates import (
     AGREE_TOLERANCES,
     RADIUS_TOLERANCES,
@@ -35,6 +40,8 @@ FEWEST_PATCHES, LEAST_PATCH_CELLS = 16, 16
 """Patches in the overlap below which tie points come of patches half as large, and cells along these."""
 LEAST_FILL = 0.25
 """Share of a patch's cells that must be filled in both rasters; half of what is usual in thin ones."""
+CELLS_TO_LOOK_AHEAD = 1_000_000
+"""Cells of a source up to which several first looks are taken at once; a larger one keeps all cores busy."""
 FAINT = 3.0
 """Times by which the best strength exceeds that of a first look where the second, closer one is not taken: it
 seldom changes a strength by half, and a margin of two is clear."""
@@ -90,11 +97,12 @@ class Judge:
             if np.isfinite(pose.score) and not any(same_pose(pose, o, near, np.inf) for o in separate):
                 separate.append(pose)
         judged: list[Candidate] = []
-        for number, pose in enumerate(separate):
-            if pose.score * CLEAR_MARGIN < known:
-                return judged, separate[number:]
-            judged.append(self.judge_one(pose, known))
-            known = max(known, GroundWeights.of([*before, *judged]).weighed(judged[-1]))
+        with closing(self._first_looks(separate)) as looks:
+            for number, pose in enumerate(separate):
+                if pose.score * CLEAR_MARGIN < known:
+                    return judged, separate[number:]
+                judged.append(self._second_look(next(looks), known))
+                known = max(known, GroundWeights.of([*before, *judged]).weighed(judged[-1]))
         return judged, []
 
     def judge_one(self, pose: Pose, known: float = 0.0) -> Candidate:
@@ -104,14 +112,52 @@ class Judge:
         so few patches agree already there that the pose will not come near the strength ``known``, the second
         is not taken.
         """
-        fine, cell = self.pyramid.at(1), self.scales.cell_m
-        factor = 2 if self.patch_m >= WIDE_PATCH_CELLS * cell else 1
+        return self._second_look(self._first_look(pose), known)
+
+    @property
+    def _first_factor(self) -> int:
+        """Cell of the first look as a multiple of the finest."""
+        return 2 if self.patch_m >= WIDE_PATCH_CELLS * self.scales.cell_m else 1
+
+    def _first_looks(self, poses: Sequence[Pose]) -> Generator[Candidate, None, None]:
+        """Take first looks in order; they do not hang on what is found, so that some are taken ahead."""
+        cells = self.pyramid.source.grid.width * self.pyramid.source.grid.height
+        ahead = usable_cores() if cells <= CELLS_TO_LOOK_AHEAD else 1
+        if ahead == 1 or len(poses) < 2:
+            yield from map(self._first_look, poses)
+            return
+        for factor in (1, self._first_factor):
+            self.pyramid.at(factor)  # so that threads do not each make it
+        with ThreadPoolExecutor(ahead) as threads:
+            left = iter(poses)
+            begun = deque(threads.submit(self._first_look, pose) for pose in islice(left, ahead))
+            try:
+                while begun:
+                    look = begun.popleft().result()
+                    begun.extend(threads.submit(self._first_look, pose) for pose in islice(left, 1))
+                    yield look
+            finally:
+                for one in begun:
+                    one.cancel()
+
+    def _first_look(self, pose: Pose) -> Candidate:
+        """Match patches in a wide surrounding of a pose."""
+        cell, factor = self.scales.cell_m, self._first_factor
         radius = min(max(self.radius_cells, round(self.search_radius_m / cell)), MAX_RADIUS_CELLS)
         patches, supporting = self._patches(factor, pose, max(1, round(radius / factor)))
-        first = Candidate(pose, patches, supporting, self._compare_ground(pose), complete=False)
+        return Candidate(pose, patches, supporting, self._compare_ground(pose), complete=False)
+
+    def _second_look(self, first: Candidate, known: float) -> Candidate:
+        """Match again from where the first look's patches put the pose, if it may come near ``known``."""
         if FAINT * first.strength < known:
             return first
-        corrected = _corrected(pose, patches, supporting, self.pyramid.at(factor), self._agree_m, fine[0])
+        pose, patches, supporting = first.pose, first.patches, first.supporting
+        assert patches is not None
+        assert supporting is not None
+        fine = self.pyramid.at(1)
+        corrected = _corrected(
+            pose, patches, supporting, self.pyramid.at(self._first_factor), self._agree_m, fine[0]
+        )
         rescored = score_nearby(*fine, corrected, 1)[0]
         # patches that do not agree must not carry a good hypothesis away
         ground = first.ground

@@ -85,12 +85,10 @@ def match_patches(
         top, left = row0 - margin, column0 - margin
         bottom, right = row0 + height + margin, column0 + width + margin
         part = image[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
-        before = (max(-top, 0), max(-left, 0))
-        after = (
-            bottom - top - before[0] - part.shape[0],
-            right - left - before[1] - part.shape[1],
-        )
-        return np.pad(part, ((before[0], after[0]), (before[1], after[1])))
+        whole = np.zeros((bottom - top, right - left), image.dtype)
+        row, column = max(-top, 0), max(-left, 0)
+        whole[row : row + part.shape[0], column : column + part.shape[1]] = part
+        return whole
 
     m = cut(mask, 0)
     A, E, M = (cut(channel, window) for channel in stack)
@@ -151,6 +149,9 @@ def _sums_of_blocks(
         wider = _blocks(target, rows * stride, columns * stride, stride + 2 * window)
         sums[:, :, some] = _correlated(images, wider)
 
+    if len(parts) == 1:
+        sum_part(parts[0])
+        return sums
     with ThreadPoolExecutor(usable_cores()) as threads:
         list(threads.map(sum_part, parts))
     return sums

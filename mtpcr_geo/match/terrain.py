@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtpcr_geo.core.arrays import Floats, Image
+from mtpcr_geo.core.arrays import Floats, Image, median
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.types import Bev, Hypothesis
 from mtpcr_geo.method.bev import coarsen
@@ -263,7 +263,7 @@ def ground_closeness(
 
 def _spread(height: Floats) -> float:
     """Return the robust spread of (n,) heights about their median."""
-    return 1.4826 * float(np.median(np.abs(height - np.median(height))))
+    return 1.4826 * median(np.abs(height - median(height)))
 
 
 def _without_plane(xy: Floats, height: Floats) -> Floats:
@@ -276,6 +276,6 @@ def _without_plane(xy: Floats, height: Floats) -> Floats:
     for _ in range(4):
         W = A * weight[:, None] ** 2
         rest = height - A @ np.linalg.lstsq(W.T @ A, W.T @ height, rcond=None)[0]
-        scale = max(1.4826 * float(np.median(np.abs(rest))), NOISE_M)
+        scale = max(1.4826 * median(np.abs(rest)), NOISE_M)
         weight = 1.0 / (1.0 + (rest / (2.0 * scale)) ** 2)
     return np.asarray(rest)

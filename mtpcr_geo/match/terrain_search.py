@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import numpy as np
 
+from mtpcr_geo.core.arrays import median
 from mtpcr_geo.core.grid import Grid
 from mtpcr_geo.core.system import usable_cores
 from mtpcr_geo.core.types import Bev, Hypothesis
@@ -266,8 +267,8 @@ class Settling:
             level = [np.ones(len(here)), *here.T] if self.plane else [np.ones(len(here))]
             J = np.column_stack([to_east, to_north, to_north * here[:, 0] - to_east * here[:, 1], *level])
             rest = self._height[known] - low
-            rest -= np.median(rest)
-            scale = max(1.4826 * float(np.median(np.abs(rest))), NOISE_M / 2)
+            rest -= median(rest)
+            scale = max(1.4826 * median(np.abs(rest)), NOISE_M / 2)
             weight = 1.0 / (1.0 + (rest / (2.0 * scale)) ** 2)
             # flat ground tells nothing: a step of a cell, or of what turns the rim by one, costs as much as
             # noise
@@ -299,8 +300,9 @@ def closest(
     relief = float(np.std(source.low[source.mask > 0])) if source.mask.any() else 0.0
     settling = Settling(source, target, plane=plane)
     ranked: list[tuple[float, Pose]] = []
-    for number, pose in enumerate(poses):
-        moved, found = settling.settle(pose)
+    with ThreadPoolExecutor(usable_cores()) as threads:
+        settled = list(threads.map(settling.settle, poses))
+    for number, (moved, found) in enumerate(settled):
         if found.known:
             ratio = np.log((relief + NOISE_M / 2) / (found.spread_m + NOISE_M / 2))
             ranked.append((np.inf if number == 0 else float(np.sqrt(found.cells) * ratio), moved))

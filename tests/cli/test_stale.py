@@ -21,9 +21,9 @@ WITHHELD = {"registered.laz", "transform.json", "transform.cloudcompare.txt", "t
 
 @pytest.fixture(scope="session")
 def unrelated(tmp_path_factory) -> Path:
-    """A cloud that fits nowhere."""
+    """A cloud that fits nowhere; a small one, for which is soon searched everywhere."""
     rng = np.random.default_rng(3)
-    xyz = rng.uniform(0, 60, (4_000, 3)) * [1, 1, 0.2] + ORIGIN
+    xyz = rng.uniform(0, 25, (1_500, 3)) * [1, 1, 0.2] + ORIGIN
     path = tmp_path_factory.mktemp("unrelated") / "unrelated.laz"
     write_cloud(path, ArrayCloud(xyz, CRS.from_epsg(25833), "unrelated"), None, CRS.from_epsg(25833))
     return path
