@@ -11,7 +11,7 @@ from mtpcr_geo.cli.options import Quiet
 from mtpcr_geo.cli.parameters import command_of
 from mtpcr_geo.cli.shared import progress_bars, say, warn
 from mtpcr_geo.core.errors import InputError, OptionError
-from mtpcr_geo.core.wording import in_a_line
+from mtpcr_geo.core.wording import counted, in_a_line
 from mtpcr_geo.pipeline.shown import INPUTS, Shown
 from mtpcr_geo.survey.options import BuildOptions, Folder
 
@@ -65,15 +65,15 @@ def run(options: SurveyVerb) -> None:
         )
     if built.gone:
         warn(
-            f"{len(built.gone)} tiles of the survey are no longer there, such as {built.gone[0]}; name all "
-            "that it shall have, and give --prune, to leave these out"
+            f"of the survey {counted(len(built.gone), 'tile')} no longer to be found, such as "
+            f"{built.gone[0]}: name all that it shall have, and give --prune, to leave these out"
         )
     if built.failed:
         for path, why in list(built.failed.items())[:MOST_NAMED]:
             warn(f"{path}: {why}")
         raise InputError(
-            f"{len(built.failed)} tiles could not be used, and are left out of the survey; mend them, and "
-            "run the same command again"
+            f"{counted(len(built.failed), 'tile')} could not be used and left out of the survey; mend what "
+            "is wrong, and run the same command again"
         )
 
 

@@ -38,6 +38,11 @@ def percent(value: float, limit: float) -> tuple[str, str]:
     return f"{found} %", f"{wanted} %"
 
 
+def counted(number: int, one: str, many: str | None = None) -> str:
+    """Return a number with its noun: "1 tile", "3 tiles"."""
+    return f"{number:,} {one if number == 1 else many or one + 's'}"
+
+
 def only(number: int, one: str, many: str | None = None) -> str:
     """Return a number with its noun: "no tie points", "only 1 tie point", "only 3 tie points"."""
     nouns = one if number == 1 else many or one + "s"

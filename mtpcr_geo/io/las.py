@@ -227,7 +227,10 @@ def open_cloud(path: str | Path, crs: CRS | None = None) -> LasCloud:
         # a pipe would be waited for
         raise InputError(f"{path} is no regular file, and clouds are read more than once; save it as one")
     with _reported(path), path.open("rb") as stream:
-        if stream.read(4) != b"LASF":
+        begins = stream.read(4)
+        if not begins:
+            raise InputError(f"{path} is empty: copy or export it again")
+        if begins != b"LASF":
             raise InputError(f"{path} is not a LAS, LAZ or COPC file (it does not begin with LASF)")
         head = Head(stream)
     if (np.asarray(head.header.scales) < 0).any():

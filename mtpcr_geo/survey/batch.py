@@ -189,7 +189,7 @@ def do(task: _Task) -> Row:
         row = replace(_failed(job, str(error)), verdict="refused")
         return _without_result(task, row, started)
     except MtpcrError as error:
-        return _without_result(task, _failed(job, f"{type(error).__name__}: {error}"), started)
+        return _without_result(task, _failed(job, str(error)), started)
     seconds = round(time.perf_counter() - started, 3)
     row = replace(_judged(job, result), seconds=seconds, folder=f"{_JOBS}/{job.name}")
     _write_row(task.folder, row)

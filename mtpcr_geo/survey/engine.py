@@ -94,7 +94,7 @@ def _tried(work: Callable[[Any], Any], item: Any, most: int = 0) -> tuple[Any, s
         with cores(most):
             return work(item), None
     except MtpcrError as error:
-        return None, f"{type(error).__name__}: {error}"
+        return None, str(error)
     except Exception as error:  # noqa: BLE001 - the other pieces are done whatever fails in this one
         return None, _defect(error)
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mtpcr_geo.core.wording import MOST_DECIMALS, beside, only, percent, visible
+from mtpcr_geo.core.wording import MOST_DECIMALS, beside, counted, only, percent, visible
 
 
 @pytest.mark.parametrize(
@@ -41,6 +41,11 @@ def test_shares_are_percent_and_few_are_only():
         "only 1 tie point",
         "only 2 tie points",
     ]
+
+
+def test_a_number_has_its_noun():
+    assert [counted(n, "tile") for n in (0, 1, 2_000)] == ["0 tiles", "1 tile", "2,000 tiles"]
+    assert counted(2, "company", "companies") == "2 companies"
 
 
 def test_lines_are_escaped_one_by_one():

@@ -221,3 +221,11 @@ def test_a_negative_scale_may_mirror_and_is_refused(tmp_path, axis):
     path.write_bytes(data)
     with pytest.raises(InputError, match=f"negative scale in {'xyz'[axis]}"):
         open_cloud(path)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_a_file_without_a_byte_is_said_to_be_empty(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"interrupted.{suffix}"
+    path.touch()
+    with pytest.raises(InputError, match=r"interrupted\..* is empty"):
+        open_cloud(path)

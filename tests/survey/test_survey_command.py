@@ -62,7 +62,7 @@ def test_a_tile_that_failed_is_said(tmp_path: Path) -> None:
     result = run("survey", "build", tmp_path / "tiles", "-o", tmp_path / "survey", "--workers", 1)
     assert result.exit_code == 5
     assert "tile1.laz" in result.stderr
-    assert "1 tiles could not be used" in result.stderr
+    assert "1 tile could not be used" in result.stderr
 
 
 def test_a_tile_that_is_gone_is_said(tmp_path: Path) -> None:
@@ -72,7 +72,7 @@ def test_a_tile_that_is_gone_is_said(tmp_path: Path) -> None:
     tiles[1].unlink()
     again = run(*arguments)
     assert again.exit_code == 0
-    assert "1 tiles of the survey are no longer there" in again.stderr
+    assert "1 tile no longer to be found" in again.stderr
     assert "tile1.laz" in again.stderr
     assert "--prune" in again.stderr
     pruned = run(*arguments, "--prune")
