@@ -35,7 +35,7 @@ BEGUN = time.monotonic()
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
-        "--within", type=float, metavar="MINUTES", help="skip, by name, tests that have not begun by then"
+        "--within", type=float, metavar="MINUTES", help="skip, and count, tests that have not begun by then"
     )
 
 

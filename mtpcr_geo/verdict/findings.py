@@ -322,8 +322,8 @@ def heights_finding(evidence: Evidence, limits: Limits) -> CheckFinding | None:
     way = "higher" if rise > 0 else "lower"
     return CheckFinding(
         f"{abs(rise):.1f} m {way}, {value} times as many heights of the source would meet the target's: the "
-        "place is wrong, or points below the ground (multipath) hide it; leave these out, or classify them "
-        "as noise (7)"
+        "place is wrong, points below the ground (multipath) hide it, or one cloud shows crowns alone and "
+        "the other what grows below them; look at a section through both, and leave out what is no surface"
     )
 
 

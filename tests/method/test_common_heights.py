@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers_scene import houses
+from scipy.spatial import cKDTree
 
 import mtpcr_geo as mg
 from mtpcr_geo.benchmark.robustness.degrade import multipath
 from mtpcr_geo.core import transforms
 from mtpcr_geo.method.common_heights import common_heights
+from mtpcr_geo.pipeline.stages.refining import CLEARLY
 
 RNG = np.random.default_rng
 
@@ -113,3 +115,51 @@ def test_a_plot_whose_ground_lies_below_mirror_images_is_registered() -> None:
     assert metrics["heights_elsewhere"] < 0.9
     refined = next(stage for stage in found.report if stage.type == "mtpcr.refine")
     assert refined.metadata["raised"] is True
+
+
+def forest(seed: int, *, from_below: bool) -> np.ndarray:
+    """A closed forest with clearings: crowns alone from the air, undergrowth and stems from below."""
+    size, clearings = 90.0, np.array([[20.0, 25, 9], [65, 60, 11], [30, 70, 7], [70, 20, 8]])
+    trees = RNG(5).uniform(0.0, size, (450, 2))
+    apart = np.hypot(*(trees[:, None] - clearings[:, :2]).transpose(2, 0, 1))
+    trees = trees[(apart > clearings[:, 2]).all(axis=1)]
+    tall, wide = RNG(6).uniform(13.0, 19.0, len(trees)), RNG(7).uniform(1.8, 3.2, len(trees))
+    rng = RNG(seed)
+    if from_below:
+        bare = np.column_stack([rng.uniform(15.0, 75.0, (60_000, 2)), np.zeros(60_000)])
+        which, turn = rng.integers(0, len(trees), 180_000), rng.uniform(0.0, 2.0 * np.pi, 180_000)
+        stem = np.arange(180_000) % 3 == 0
+        away = np.where(stem, 0.2, wide[which] * np.sqrt(rng.random(180_000)))
+        up = np.where(stem, rng.uniform(0.0, 8.0, 180_000), rng.uniform(2.0, 8.0, 180_000))
+        grown = np.column_stack(
+            [trees[which] + away[:, None] * np.column_stack([np.cos(turn), np.sin(turn)]), up]
+        )
+        points = np.vstack([bare, grown])
+        points = points[((points[:, :2] > 15.0) & (points[:, :2] < 75.0)).all(axis=1)]
+    else:
+        xy = rng.uniform(0.0, size, (400_000, 2))
+        off, which = cKDTree(trees).query(xy)
+        share = off / wide[which]
+        crown = tall[which] - 5.0 * (1.0 - np.sqrt(np.clip(1.0 - share**2, 0.0, 1.0)))
+        seen = (share < 1.0) & (rng.random(len(xy)) > 0.003)
+        points = np.column_stack([xy, np.where(seen, crown - rng.exponential(0.7, len(xy)), 0.0)])
+    points[:, 2] += 0.8 * np.sin(points[:, 0] / 9.0) + 0.6 * np.cos(points[:, 1] / 11.0)
+    return points + rng.normal(0.0, 0.02, points.shape)
+
+
+def test_undergrowth_is_not_raised_into_the_crowns() -> None:
+    T = transforms.translation((30.0, -12.0, 5.0)) @ transforms.about(
+        np.zeros(3), transforms.yaw_matrix(np.radians(25.0))
+    )
+    source, target = forest(1, from_below=True), forest(2, from_below=False)
+    found = common_heights(source, target, 0.5, 0.5)
+    assert found is not None
+    assert found.asked
+    assert found.elsewhere[0] > CLEARLY
+    result = mg.register(
+        transforms.apply(transforms.inverse(T), source), target, level="none", recording=False
+    )
+    assert result.T_target_source is not None
+    left = result.T_target_source @ transforms.inverse(T)
+    middle = np.array([[45.0, 45.0, 4.0]])
+    assert np.linalg.norm(transforms.apply(left, middle) - middle) < 0.3

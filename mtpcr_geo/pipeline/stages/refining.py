@@ -13,12 +13,15 @@ from mtpcr_geo.core.errors import RegistrationError
 from mtpcr_geo.core.types import Pair, Refinement
 from mtpcr_geo.method.common_heights import common_heights_of
 from mtpcr_geo.method.refine import RefineSettings, refine
+from mtpcr_geo.method.settle import FEWEST_GROUND_CELLS
 from mtpcr_geo.method.upright import points_near, seen_upright
-from mtpcr_geo.verdict.evidence import middle_of_tie_points, tie_points_agreeing
+from mtpcr_geo.verdict.evidence import agreement, middle_of_tie_points, tie_points_agreeing
 
 CLEARLY = 1.5
 """Times as many common heights from which on another height is the right one: beside the right one, no other
 has more than 0.7 on nine real pairs and thirty simulated ones."""
+GROUND_KEPT = 0.1
+"""Share of the cells of common ground agreeing before that must agree at another height."""
 
 
 def refined_pair(pair: Pair, settings: RefineSettings) -> Refinement:
@@ -64,8 +67,8 @@ def _raised(pair: Pair, first: Refinement, settings: RefineSettings) -> Refineme
     Nothing is settled on the ground then, which had led elsewhere.
 
     Returns:
-        None where the lowest points are ground, or no other height is clearly better, before and after that
-        refinement.
+        None where the lowest points are ground, where no other height is clearly better, before and after
+        that refinement, or where hardly any of the common ground would be left.
 
     """
     before = common_heights_of(pair, first.T)
@@ -78,5 +81,10 @@ def _raised(pair: Pair, first: Refinement, settings: RefineSettings) -> Refineme
         return None
     after = common_heights_of(pair, found.T)
     if after is None or after.here < CLEARLY * before.here:
+        return None
+    # crowns from the air over undergrowth from the ground fill the same heights some metres off, but there
+    # the lowest points of both meet nowhere
+    ground = agreement(pair, first.T)[1]
+    if ground >= FEWEST_GROUND_CELLS and agreement(pair, found.T)[1] < GROUND_KEPT * ground:
         return None
     return replace(found, T_before=first.T_before, raised=True)
